@@ -60,7 +60,8 @@ def _fields(domain: Domain, quadrature: Quadrature) -> list[Function]:
     stiffness = slopes(mesh, degree, dx)
     radial = _radial(harmonic(stiffness, inner, outer), degree, dx, thickness)
     axial = _axial(radial, dx, starts, ends, thickness)
-    (trial, test), r, a = _arguments(stiffness.space), _unit(radial), _unit(axial)
+    trial, test = _arguments(stiffness.space)
+    r, a = _unit(radial), _unit(axial)
     along_r = SpdSolver(ufl.inner(r, ufl.grad(trial)) * ufl.inner(r, ufl.grad(test)) * dx)
     through = [
         _length(along_r, r, dx, facets, sign) for facets, sign in ((inner, 1.0), (outer, -1.0))
@@ -89,21 +90,18 @@ def harmonic(stiffness: SpdSolver, low: Facets, high: Facets) -> Function:
 
 def _radial(phi: Function, degree: int, dx: ufl.Measure, thickness: float) -> Function:
     """Project the unit gradients of the harmonic function onto continuous vectors."""
-    mesh, slope, (trial, test) = (
-        phi.function_space.mesh,
-        ufl.grad(phi),
-        _arguments(phi.function_space),
-    )
+    mesh, slope = phi.function_space.mesh, ufl.grad(phi)
+    trial, test = _arguments(phi.function_space)
     least, way = (
         dolfinx.fem.Constant(mesh, number)
         for number in (np.float64(LEAST_SLOPE / thickness), np.zeros(3))
     )
     direction = slope / ufl.sqrt(ufl.inner(slope, slope) + least**2)
-    mass, found = SpdSolver(trial * test * dx), lagrange(mesh, degree, (3,))
+    mass, directions = SpdSolver(trial * test * dx), lagrange(mesh, degree, (3,))
     for component in range(3):
         way.value[:] = np.eye(3)[component]
-        found.x.array[component::3] = mass.solve(ufl.inner(direction, way) * test * dx).x.array
-    return found
+        directions.x.array[component::3] = mass.solve(ufl.inner(direction, way) * test * dx).x.array
+    return directions
 
 
 def _axial(

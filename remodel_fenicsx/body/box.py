@@ -84,7 +84,8 @@ class Cube(Box):
 
     Its faces x = 0, y = 0 and z = 0 slide in their planes.
 
-    Its keyword arguments are the keys of `[geometry]`: `side` in the unit `length_unit`, or in any one unit.
+    Its keyword arguments are the keys of `[geometry]`: `side` in the unit `length_unit`,
+    or in any one unit.
 
     Raises
     ------
@@ -187,7 +188,8 @@ class Sheet(Box):
     may be prescribed; without either the edge is free. Lengths: 1e-6 to 1e6, one up to 10,000 times
     the other.
 
-    Its keyword arguments are the keys of `[geometry]`: lengths in the unit `length_unit`, or in any one unit.
+    Its keyword arguments are the keys of `[geometry]`: lengths in the unit `length_unit`,
+    or in any one unit.
 
     Raises
     ------
@@ -230,8 +232,8 @@ class Sheet(Box):
             Column(
                 f"nominal_stress_{words}",
                 "stress",
-                f"first Piola-Kirchhoff stress P_{words * (3 - len(words))}, volume mean: along {words[0]} on edges "
-                f"across {words[-1]}",
+                f"first Piola-Kirchhoff stress P_{words * (3 - len(words))}, volume mean: "
+                f"along {words[0]} on edges across {words[-1]}",
                 _nominal(*place),
             )
             for words, place in (("x", (0, 0)), ("y", (1, 1)), ("xy", (0, 1)), ("yx", (1, 0)))
@@ -298,7 +300,8 @@ def box_domain(
     --------
     >>> from remodel_fenicsx import parts
     >>> from remodel_fenicsx.extend import box_domain
-    >>> sheet = box_domain("sheet", {"width": 2.0}, (2.0, 2.0, 0.5), (4, 4, 1), parts.Mesh(refinement=2))
+    >>> mesh = parts.Mesh(refinement=2)
+    >>> sheet = box_domain("sheet", {"width": 2.0}, (2.0, 2.0, 0.5), (4, 4, 1), mesh)
     >>> sheet.number_of_elements, sheet.dimensions
     (128, {'width': 2.0})
     """

@@ -299,9 +299,9 @@ def cells_of(mesh: Mesh, facets: npt.NDArray[np.int32]) -> tuple[Integers, Integ
 def dof_of_node(mesh: Mesh, space: FunctionSpace) -> Integers:
     """Return the (blocked) degree of freedom at each local geometry node, (nodes,)."""
     # The space and the geometry have the same degree: node k of an element is its dof k.
-    found = np.zeros(len(mesh.geometry.x), dtype=np.int64)
-    found[compat.geometry_dofmap(mesh).reshape(-1)] = space.dofmap.list.reshape(-1)
-    return found
+    dofs = np.zeros(len(mesh.geometry.x), dtype=np.int64)
+    dofs[compat.geometry_dofmap(mesh).reshape(-1)] = space.dofmap.list.reshape(-1)
+    return dofs
 
 
 # ---------------------------------------------------------------- structured, without Gmsh
@@ -332,11 +332,14 @@ def lattice_domain(
         comm, cells=elements[here], x=points[here], e=symbolic_mesh(kind, degree)
     )
     dimension = mesh.topology.dim - 1
-    found = [
+    facets_of_faces = [
         dolfinx.mesh.locate_entities_boundary(mesh, dimension, marker) for marker in faces.values()
     ]
-    values = np.repeat(np.arange(1, len(found) + 1, dtype=np.int32), [len(one) for one in found])
-    facets = np.concatenate(found).astype(np.int32)
+    values = np.repeat(
+        np.arange(1, len(facets_of_faces) + 1, dtype=np.int32),
+        [len(one) for one in facets_of_faces],
+    )
+    facets = np.concatenate(facets_of_faces).astype(np.int32)
     order = np.argsort(facets)
     tags = dolfinx.mesh.meshtags(mesh, dimension, facets[order], values[order])
     return Domain(

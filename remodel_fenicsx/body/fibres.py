@@ -102,8 +102,8 @@ def read_fibre_file(path: Path) -> FibreFile:
             measured, places, data = _of_mesh(path)
     except OSError as error:
         raise UnreadableFile(f"cannot be read: {error.strerror or error}") from error
-    if (found := fibres_problem(measured)) is not None:
-        raise UnreadableFile(found)
+    if (problem := fibres_problem(measured)) is not None:
+        raise UnreadableFile(problem)
     if places is not None and not np.isfinite(places).all():
         raise UnreadableFile("has positions that are not finite")
     if "angle" in measured and (words := convention_doubt("angle", measured["angle"])):

@@ -17,7 +17,8 @@ from remodel_fenicsx.model.tensors import Array
 gmsh: Any = Late("gmsh")  # the import takes 0.2 s, and only rank 0 needs it
 
 # Gmsh merges points that are closer than 1e-8, and crashes on much longer or flatter bodies.
-SMALLEST_LENGTH, LARGEST_LENGTH, LARGEST_LENGTH_RATIO = 1e-6, 1e6, 1e4
+SMALLEST_LENGTH, LARGEST_LENGTH = 1e-6, 1e6
+LARGEST_LENGTH_RATIO = 1e4
 
 
 class GeometryError(RemodelError, RuntimeError):
@@ -77,10 +78,12 @@ def named_groups() -> tuple[dict[str, int], dict[str, int]]:
     """Return the numbers of the model's faces and disjoint regions by name."""
     # dolfinx checks these conditions only on rank 0. A failure there would leave the other ranks
     # waiting.
-    faces, regions, kinds = _groups(2), _groups(3), gmsh.model.mesh.getElements(3)[0]
+    faces, regions = _groups(2), _groups(3)
+    kinds, *_ = gmsh.model.mesh.getElements(3)
     if not regions or len(kinds) != 1 or not faces:
         raise GeometryError(
-            f"{len(regions)} named volumes, {len(kinds)} types of elements, {len(faces)} named faces"
+            f"{len(regions)} named volumes, {len(kinds)} types of elements, "
+            f"{len(faces)} named faces"
         )
     for _, volume in gmsh.model.getEntities(3):
         groups = gmsh.model.getPhysicalGroupsForEntity(3, volume)
@@ -164,22 +167,24 @@ def reverse(curves: Sequence[int]) -> list[int]:
 
 
 def ring(
-    inner: Sequence[Point], outer: Sequence[Point], inner_lines: Sequence[int], outer_lines: Sequence[int],
+    inner: Sequence[Point], outer: Sequence[Point],
+    inner_lines: Sequence[int], outer_lines: Sequence[int],
     spokes: Sequence[Sequence[int]], element: str,
 ) -> list[int]:  # fmt: skip
     """Add blocks between two open or closed polygons, from each spoke to the next."""
-    blocks = len(spokes) - (len(inner) - len(inner_lines))
-    part, found = len(inner_lines) // blocks, []
-    for i in range(blocks):
-        k, m, next_spoke = i * part, (i + 1) * part % len(inner), spokes[(i + 1) % len(spokes)]
+    number = len(spokes) - (len(inner) - len(inner_lines))
+    part, blocks = len(inner_lines) // number, []
+    for i in range(number):
+        k, m = i * part, (i + 1) * part % len(inner)
+        next_spoke = spokes[(i + 1) % len(spokes)]
         edges = [
             spokes[i],
             outer_lines[k : k + part],
             reverse(next_spoke),
             reverse(inner_lines[k : k + part]),
         ]
-        found.append(block(edges, [inner[k], outer[k], outer[m], inner[m]], element))
-    return found
+        blocks.append(block(edges, [inner[k], outer[k], outer[m], inner[m]], element))
+    return blocks
 
 
 def extrude(

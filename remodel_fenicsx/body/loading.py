@@ -77,7 +77,8 @@ class Loading:
     """
 
     def __init__(self, domain: Domain, unknown: Function, kinematics: Kinematics | None = None):
-        self.domain, self.unknown, self.kinematics = domain, unknown, kinematics or FullKinematics()
+        self.domain, self.unknown = domain, unknown
+        self.kinematics = kinematics or FullKinematics()
         self.space = unknown.function_space
         self.weight = self.kinematics.weight(domain.mesh)
         self.boundary_conditions: list[DirichletBC] = []
@@ -141,9 +142,9 @@ class Loading:
             lambda x: np.linalg.norm(x - np.reshape(point, (3, 1)), axis=0) < tolerance,
         )
         owned = subspace.dofmap.index_map.size_local * subspace.dofmap.index_map_bs
-        found = self.domain.mesh.comm.allreduce(int(np.sum(dofs[0] < owned)), MPI.SUM)
-        if found != 1:
-            raise ValueError(f"{found} mesh nodes at {point}: a support needs exactly one")
+        number = self.domain.comm.allreduce(int(np.sum(dofs[0] < owned)), MPI.SUM)
+        if number != 1:
+            raise ValueError(f"{number} mesh nodes at {point}: a support needs exactly one")
         # With the dofs of the subspace only, the value is a Constant, as for faces.
         self.boundary_conditions.append(
             dolfinx.fem.dirichletbc(self.constant(0.0), dofs[0], subspace)
@@ -170,10 +171,9 @@ class Loading:
             If the kinematics is not that of a mesh in three dimensions.
         """
         self._check_three_dimensional("fixed facets")
-        value = dolfinx.fem.Constant(self.domain.mesh, np.zeros(3, dtype=PETSc.ScalarType))
-        dofs = dolfinx.fem.locate_dofs_topological(
-            self.space, self.domain.mesh.topology.dim - 1, facets
-        )
+        mesh = self.domain.mesh
+        value = dolfinx.fem.Constant(mesh, np.zeros(3, dtype=PETSc.ScalarType))
+        dofs = dolfinx.fem.locate_dofs_topological(self.space, mesh.topology.dim - 1, facets)
         self.boundary_conditions.append(dolfinx.fem.dirichletbc(value, dofs, self.space))
         if name is not None:
             self._take(name, value, direction)
@@ -242,11 +242,8 @@ class Loading:
         face
             Name of the face in `Domain.faces`.
         """
-        pressure, normal, measure = (
-            self.magnitude(name),
-            ufl.FacetNormal(self.domain.mesh),
-            self.surface_measure(face),
-        )
+        pressure = self.magnitude(name)
+        normal, measure = ufl.FacetNormal(self.domain.mesh), self.surface_measure(face)
 
         def potential(u: Function) -> ufl.Form:
             place = ufl.SpatialCoordinate(self.domain.mesh) + self.kinematics.displacement(u)
@@ -471,8 +468,10 @@ class Loading:
         subspace = self.kinematics.subspace(self.space, component)
         if subspace is None:
             return
-        dimension = self.domain.mesh.topology.dim - 1
-        dofs = dolfinx.fem.locate_dofs_topological(subspace, dimension, self.domain.facets(face))
+        topology = self.domain.mesh.topology
+        dofs = dolfinx.fem.locate_dofs_topological(
+            subspace, topology.dim - 1, self.domain.facets(face)
+        )
         self.boundary_conditions.append(dolfinx.fem.dirichletbc(value, dofs, subspace))
 
 

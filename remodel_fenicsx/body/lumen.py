@@ -102,18 +102,18 @@ def _signed_volume(points: Array, triangles: Integers) -> float:
 def remeshed(surface: Surface, size: float) -> tuple[Surface, Integers]:
     """Remesh the surface by Gmsh with triangles of a size, rounded.
 
-    Also return the nearest corner of the given surface for each new corner.
+    Also return the nearest corner of the original surface for each new corner.
     """
     from scipy.spatial import cKDTree
 
     numbers = io.BytesIO()
     np.savez(numbers, points=surface.points, triangles=surface.triangles, size=size)
     try:  # in a child process, because Gmsh ignores signals
-        found = made_apart(numbers.getvalue(), "the surface", f"{__name__}:by_gmsh")
+        arrays = made_apart(numbers.getvalue(), "the surface", f"{__name__}:by_gmsh")
     except UnreadableFile as error:
         reason = str(error).removeprefix(DAMAGED)
         raise SceneError(f"--size {size:g}: Gmsh could not remesh the surface: {reason}") from error
-    points, triangles = found["points"], found["triangles"]
+    points, triangles = arrays["points"], arrays["triangles"]
     on_rims = np.isin(np.arange(len(points)), np.concatenate(rims(triangles)))
     divided = Surface(rounded(surface, points, on_rims), triangles, {})
     return oriented(divided, "the surface by Gmsh"), cKDTree(surface.points).query(points)[1]
@@ -145,7 +145,7 @@ def rounded(surface: Surface, places: Array, on_rims: Flags) -> Array:
     1/2, exact for parabolas. T. Boubekeur and M. Alexa, Phong tessellation (2008).
     """
     rims_of_it = rims(surface.triangles)
-    normals, found = _normals(surface, rims_of_it), np.empty_like(places)
+    normals, lifted = _normals(surface, rims_of_it), np.empty_like(places)
     for simplices, chosen in ((surface.triangles, ~on_rims), (np.concatenate(rims_of_it), on_rims)):
         rows, flat = nearest(surface.points, simplices, places[chosen])
         corners, upwards = surface.points[simplices[rows]], normals[simplices[rows]]
@@ -153,14 +153,14 @@ def rounded(surface: Surface, places: Array, on_rims: Flags) -> Array:
         shares = np.einsum("nij,nj->ni", np.linalg.pinv(sides), flat - corners[:, 0])
         shares = np.column_stack([1 - shares.sum(axis=1), shares])
         lifts = np.einsum("nki,nki->nk", corners - flat[:, None], upwards)
-        found[chosen] = flat + np.einsum("nk,nk,nki->ni", shares, lifts, upwards) / 2
-    return found
+        lifted[chosen] = flat + np.einsum("nk,nk,nki->ni", shares, lifts, upwards) / 2
+    return lifted
 
 
 def nearest(points: Array, simplices: Integers, places: Array) -> tuple[Integers, Array]:
     """Return the index of the nearest edge or triangle to each position, and the nearest point."""
-    found: Any = polygons(points, simplices).find_closest_cell(places, return_closest_point=True)
-    return found
+    pair: Any = polygons(points, simplices).find_closest_cell(places, return_closest_point=True)
+    return pair
 
 
 def polygons(points: Array, simplices: Integers) -> Any:
@@ -187,7 +187,7 @@ class ExtrudedWall(NamedTuple):
 def extrude_wall(
     surface: Surface, given: Surface, thickness: Array, layers: Mapping[str, float], through: int
 ) -> ExtrudedWall:
-    """Extrude prisms from a surface outwards, curved as the given one, by a thickness (points,).
+    """Extrude prisms from a surface outwards, curved as the original one, by a thickness (points,).
 
     Each layer has its fraction of the thickness.
     """
@@ -260,18 +260,18 @@ def _straightened(points: Array, tetrahedra: Integers) -> int:
 
 
 def _around(surface: Surface, vectors: Array, openings: Sequence[Integers]) -> Array:
-    """Unit vectors at the points, sums over the triangles around them (triangles, 3); those of a rim in its plane."""
-    found = np.zeros_like(surface.points)
-    np.add.at(found, surface.triangles, vectors[:, None])
+    """Return unit sums of vectors (triangles, 3) around each point; at a rim, in its plane."""
+    sums = np.zeros_like(surface.points)
+    np.add.at(sums, surface.triangles, vectors[:, None])
     for rim in openings:
         nodes = np.unique(rim)
         across = np.linalg.svd(surface.points[nodes] - surface.points[nodes].mean(axis=0))[2][2]
-        found[nodes] -= np.outer(found[nodes] @ across, across)
-    return found / np.linalg.norm(found, axis=1, keepdims=True)
+        sums[nodes] -= np.outer(sums[nodes] @ across, across)
+    return sums / np.linalg.norm(sums, axis=1, keepdims=True)
 
 
 def _normals(surface: Surface, openings: Sequence[Integers]) -> Array:
-    """Unit vectors out of the lumen at the points."""
+    """Return unit vectors out of the lumen at the points."""
     return _around(surface, area_vectors(surface.points[surface.triangles]), openings)
 
 
@@ -323,8 +323,8 @@ def write_wall(
     _check_units(radius, size, depth)
     if len(read.triangles) > LARGE_SURFACE:
         announce(f"{surface}: remeshing {len(read.triangles)} triangles takes minutes")
-    found, near = remeshed(read, size)
-    wall = extrude_wall(found, read, depth[near], shares or {"wall": 1.0}, through)
+    divided, near = remeshed(read, size)
+    wall = extrude_wall(divided, read, depth[near], shares or {"wall": 1.0}, through)
     if taken := shares.keys() & wall.faces:
         raise SceneError(f"--layers {min(taken)}=...: a face has this name; rename the layer")
     names = list(shares) or ["wall"]
@@ -344,7 +344,8 @@ def write_wall(
         wall.points[nodes] - nearest(wall.points, _halved(inner), wall.points[nodes])[1], axis=1
     )
     lines = [
-        f"{path}: {len(wall.tetrahedra)} tetrahedra of degree 2, {max(through, len(names))} through the wall",
+        f"{path}: {len(wall.tetrahedra)} tetrahedra of degree 2, "
+        f"{max(through, len(names))} through the wall",
         f"thickness {between.min():.4g} to {between.max():.4g} at the nodes",
         f"faces {', '.join(wall.faces)}; "
         + (f"regions {', '.join(names)}" if shares else "one region"),
@@ -370,22 +371,22 @@ def _check_units(radius: float, size: float, thickness: Array) -> None:
             option == "--thickness" and length < LEAST_RADII * radius
         ):
             raise SceneError(
-                f"{option}: {length:.3g} is {length / radius:.3g} times the lumen's radius, which is {radius:.3g}: "
-                "is it in another unit than the surface?"
+                f"{option}: {length:.3g} is {length / radius:.3g} times the lumen's radius, which "
+                f"is {radius:.3g}: is it in another unit than the surface?"
             )
 
 
 def _thicknesses(said: Sequence[str]) -> dict[str, float]:
     """Parse the thickness of each layer, by name."""
-    found: dict[str, float] = {}
+    layers: dict[str, float] = {}
     for text in said:
         name, _, number = text.partition("=")
-        if not name.isidentifier() or name in found or (value := _positive(number)) is None:
+        if not name.isidentifier() or name in layers or (value := _positive(number)) is None:
             raise SceneError(
                 f"--layers {text}: must be NAME=THICKNESS, each name once, from the lumen outwards"
             )
-        found[name] = value
-    return found
+        layers[name] = value
+    return layers
 
 
 def _thickness(said: str | None, layers: Mapping[str, float], surface: Surface) -> Array:

@@ -89,16 +89,17 @@ def _faces(value: Any) -> Any:
         raise validation_error(
             "must be a table: names or numbers of the file's faces or volumes, as in inner = 3"
         )
-    found = {}
+    groups = {}
     for name, entry in value.items():
         entries = entry if isinstance(entry, (list, tuple)) else [entry]
         if not entries or not all(
             isinstance(one, (str, int)) and not isinstance(one, bool) for one in entries
         ):
-            rule = "must be a name or a number in the file, or a list of them; a face may be { file = 'surface.vtp' }"
+            rule = "must be a name or a number in the file, or a list of them"
+            rule += "; a face may be { file = 'surface.vtp' }"
             raise validation_error(rule, str(name), entry)
-        found[str(name)] = tuple(entries)
-    return found
+        groups[str(name)] = tuple(entries)
+    return groups
 
 
 Groups = Annotated[dict[str, Names], BeforeValidator(_faces), Field(json_schema_extra=_GROUPS)]
@@ -129,13 +130,13 @@ def _file(value: Any) -> Any:
 def _together(geometry: Mapping[str, Any]) -> dict[str, Any]:
     """Add surfaces that faces name as files, inner = { file = "lumen.vtp" }, to the key `file`."""
     faces, file = geometry.get("faces", {}), geometry.get("file")
-    files, found = file if isinstance(file, (list, tuple)) else [file], {}
+    files, named = file if isinstance(file, (list, tuple)) else [file], {}
     for face, one in faces.items() if isinstance(faces, Mapping) else ():
         if isinstance(one, Mapping) and _ends_with(one.get("file"), SURFACES):
-            files, found[face] = [*files, one["file"]], Path(one["file"]).stem
+            files, named[face] = [*files, one["file"]], Path(one["file"]).stem
     return (
-        {**geometry, "file": [*dict.fromkeys(files)], "faces": {**faces, **found}}
-        if found
+        {**geometry, "file": [*dict.fromkeys(files)], "faces": {**faces, **named}}
+        if named
         else dict(geometry)
     )
 
@@ -143,14 +144,14 @@ def _together(geometry: Mapping[str, Any]) -> dict[str, Any]:
 def _numbers(key: str, entries: Names, names: Mapping[str, int], groups: Integers) -> list[int]:
     """Return the file's numbers of a face's or region's entries, names or numbers."""
     there = {*unique_in_order(groups)} - {0}
-    found = [names.get(entry, 0) if isinstance(entry, str) else int(entry) for entry in entries]
-    for entry, number in zip(entries, found, strict=True):
+    numbers = [names.get(entry, 0) if isinstance(entry, str) else int(entry) for entry in entries]
+    for entry, number in zip(entries, numbers, strict=True):
         if number not in there:
             listed = [*map(repr, names), *map(str, sorted(there - {*names.values()}))]
             word = "face" if key.startswith("faces") else "volume"
             rule = f"the file has no such {word}; it has {', '.join(listed) or 'none'}"
             raise SceneError(f"geometry.{key} = {format_value(entry)}: {rule}")
-    return found
+    return numbers
 
 
 class FileBody(WithRegions, FromFile):
@@ -161,7 +162,8 @@ class FileBody(WithRegions, FromFile):
 
     file: Annotated[str | tuple[str, ...], BeforeValidator(_file)] = Field(
         json_schema_extra={
-            "allowed": "the path of a file .msh, .vtu, .vtk or .xdmf, or a list with surfaces after it"
+            "allowed": "the path of a file .msh, .vtu, .vtk or .xdmf, "
+            "or a list with surfaces after it"
         }
     )
     """The mesh, relative to the scene. In a list, surfaces of its triangles may follow (`.vtp`,
@@ -214,9 +216,9 @@ class FileBody(WithRegions, FromFile):
     @classmethod
     def with_files_from(cls, geometry: Mapping[str, Any], folder: Path) -> dict[str, Any]:
         """Return the keys as read, with the absolute paths of the files."""
-        found = _together(geometry)
-        places = [str(folder.absolute() / file) for file in _files(found.get("file"))]
-        return found | ({"file": places} if places else {})
+        values = _together(geometry)
+        places = [str(folder.absolute() / file) for file in _files(values.get("file"))]
+        return values | ({"file": places} if places else {})
 
     @classmethod
     def defaults_of(cls, own: Mapping[str, Any]) -> dict[str, Any]:
@@ -226,10 +228,10 @@ class FileBody(WithRegions, FromFile):
             return cls.defaults
         tags, (file, *surfaces) = own["geometry"].get("tags"), map(Path, files)
         try:
-            found = read_mesh(file, tags if isinstance(tags, str) else None, surfaces)
+            mesh_file = read_mesh(file, tags if isinstance(tags, str) else None, surfaces)
         except UnreadableFile as error:
             raise validation_error(str(error), "geometry.file", file.name) from None
-        return cls.defaults | {"mesh": {"element": found.kind, "degree": found.degree}}
+        return cls.defaults | {"mesh": {"element": mesh_file.kind, "degree": mesh_file.degree}}
 
     def kept_files(self) -> tuple[dict[str, Any], dict[str, bytes]]:
         """Return the file under its own name, to store with the scene, and its SHA-256."""
@@ -278,8 +280,11 @@ class FileBody(WithRegions, FromFile):
         file = replace(file, points=scale * file.points)
         extent = float(np.ptp(file.points, axis=0).max())
         if not SMALLEST_LENGTH <= extent <= LARGEST_LENGTH:
-            limits = f"must be {SMALLEST_LENGTH:g} to {LARGEST_LENGTH:g} (geometry.file_unit, length_unit)"
-            raise self._fault(f"the body is {extent:g} long in the scene's unit; {limits}")
+            limits = f"must be {SMALLEST_LENGTH:g} to {LARGEST_LENGTH:g}"
+            raise self._fault(
+                f"the body is {extent:g} long in the scene's unit; {limits} "
+                "(geometry.file_unit, length_unit)"
+            )
         try:
             boundary = self.boundary(file)
         except mesh_faces.FaceError as error:
@@ -289,7 +294,8 @@ class FileBody(WithRegions, FromFile):
         except UnreadableFile as error:
             raise self._fault(str(error)) from None
         self.check_boundary(file, boundary)
-        counts = f"{len(file.cells)} {file.kind[:-3]}ra of degree {file.degree}, {len(file.points)} nodes"
+        counts = f"{len(file.cells)} {file.kind[:-3]}ra of degree {file.degree}, "
+        counts += f"{len(file.points)} nodes"
         log.info("%s: %s, SHA-256 %s", ", ".join([self._name, *file.surfaces]), counts, file.sha256)
         if mesh is not None and (mesh.refinement, mesh.degree) != (1, file.degree):
             file, boundary = self._refined(file, mesh)
@@ -332,13 +338,13 @@ class FileBody(WithRegions, FromFile):
 
     def boundary(self, file: MeshFile) -> mesh_faces.Boundary:
         """Return the boundary with the body's faces, and the file's further named faces."""
-        names, found = file.names[2], file.facet_groups
+        names, of_facets = file.names[2], file.facet_groups
         asked = {face: (face,) for face in self.face_names} | self.faces
         groups = {
-            face: _numbers(f"faces.{face}", entries, names, found)
+            face: _numbers(f"faces.{face}", entries, names, of_facets)
             for face, entries in asked.items()
         }
-        others = {*unique_in_order(found)}.difference(*groups.values())
+        others = {*unique_in_order(of_facets)}.difference(*groups.values())
         further = {name: [n] for name, n in names.items() if n in others and name not in groups}
         return mesh_faces.boundary_of(file, groups, self.open_boundary, further)
 
@@ -347,7 +353,8 @@ class FileBody(WithRegions, FromFile):
         if 0 in numbers and len(numbers) > 1:
             lost = file.cell_numbers[file.cell_groups == 0]
             raise self._fault(
-                f"{len(lost)} elements are in no named volume, the first is {lost[0]}; name all volumes, or none"
+                f"{len(lost)} elements are in no named volume, the first is {lost[0]}; "
+                "name all volumes, or none"
             )
         names = {number: name for name, number in file.names[3].items()}
         return {names.get(number, str(number) if number else "body"): number for number in numbers}
@@ -425,8 +432,8 @@ class FileBody(WithRegions, FromFile):
             if load == "displacement":
                 if kind not in HELD_ACROSS:
                     able = " or ".join(map(repr, HELD_ACROSS))
-                    rule = f"its support ({kind!r}) lets it move; a face that is displaced must be {able}"
-                    raise SceneError(f"{key}: {rule}")
+                    rule = f"its support ({kind!r}) lets it move"
+                    raise SceneError(f"{key}: {rule}; a face that is displaced must be {able}")
                 if domain.boundary.goes_around(face):  # type: ignore[attr-defined]
                     raise SceneError(
                         f"{key}: this face goes around the body, so that there is no direction"
@@ -475,16 +482,17 @@ def _at(face: str, m: Any) -> Flags:
     """Mark the elements that have a facet on a face."""
     from remodel_fenicsx.body.domain import cells_of
 
-    found = np.zeros(m.quadrature.shape[0], dtype=np.bool_)
-    found[cells_of(m.domain.mesh, m.domain.facets(face))[0]] = True
-    return found
+    is_at_face = np.zeros(m.quadrature.shape[0], dtype=np.bool_)
+    is_at_face[cells_of(m.domain.mesh, m.domain.facets(face))[0]] = True
+    return is_at_face
 
 
 def _middle(m: Any) -> Flags:
     """Mark the elements at mid-wall; every mesh has some."""
     from remodel_fenicsx.fem.compat import geometry_dofmap
 
-    depths = m.state.cells.local_axes.nodal_depth[geometry_dofmap(m.domain.mesh)]
+    cells = m.state.cells
+    depths = cells.local_axes.nodal_depth[geometry_dofmap(m.domain.mesh)]
     return (depths.min(axis=1) <= 0.5 + NODES_AT_A_DEPTH) & (
         depths.max(axis=1) >= 0.5 - NODES_AT_A_DEPTH
     )
@@ -647,7 +655,8 @@ SPLIT = {"tetrahedron": {3: 4, 2: 2}, "hexahedron": {3: 5, 2: 3}}
 def refined(file: MeshFile, refinement: int, degree: int) -> MeshFile:
     """Halve the edges of a mesh of plane elements `log2(refinement)` times, and set the degree."""
     with gmsh_model("file") as gmsh:
-        model, mesh, number = gmsh.model, gmsh.model.mesh, [*range(1, len(file.points) + 1)]
+        model, mesh = gmsh.model, gmsh.model.mesh
+        number = [*range(1, len(file.points) + 1)]
         for dimension, rows, groups in (
             (3, file.cells, file.cell_groups),
             (2, file.facets, file.facet_groups),

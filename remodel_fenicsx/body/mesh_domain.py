@@ -46,11 +46,12 @@ class MeshDomain(Domain):
 
     def of_parts(self, face: str, name: str) -> Function:
         """Return `normal` or `centre` of a face's parts, constant on each adjacent element."""
-        found = dolfinx.fem.Function(dolfinx.fem.functionspace(self.mesh, ("DG", 0, (3,))))
-        values, dofs = found.x.array.reshape(-1, 3), found.function_space.dofmap.list.reshape(-1)
+        function = dolfinx.fem.Function(dolfinx.fem.functionspace(self.mesh, ("DG", 0, (3,))))
+        dofmap = function.function_space.dofmap
+        values, dofs = function.x.array.reshape(-1, 3), dofmap.list.reshape(-1)
         for part, facets in self.facets_of_parts(face):
             values[dofs[cells_of(self.mesh, facets)[0]]] = getattr(part, name)
-        return found
+        return function
 
     def facets_of_parts(self, face: str) -> list[tuple[Face, NDArray[np.int32]]]:
         """Return the parts of a face with their local facets."""
@@ -74,7 +75,8 @@ class MeshDomain(Domain):
         # the sections' centres, where 1/R has its mean.
         if not {"inlet", "outlet"} <= set(self.faces):
             return 0.0
-        mesh, degree = self.mesh, int(self.mesh.geometry.cmap.degree)
+        mesh = self.mesh
+        degree = int(mesh.geometry.cmap.degree)
         dx = ufl.Measure("dx", domain=mesh, metadata={"quadrature_degree": 2 * degree})
         psi = harmonic(slopes(mesh, degree, dx), self.facets("inlet"), self.facets("outlet"))
         slope, one = ufl.sqrt(ufl.inner(ufl.grad(psi), ufl.grad(psi))), dolfinx.fem.Constant(
@@ -90,17 +92,14 @@ def shared(
     shape: str = "mesh",
 ) -> MeshDomain:
     """Distribute the mesh that rank 0 reads. Collective."""
-    found = raise_on_all_ranks(comm, lambda: read() if comm.rank == 0 else None)
+    content = raise_on_all_ranks(comm, lambda: read() if comm.rank == 0 else None)
     os.environ.setdefault("SCOTCH_PTHREAD_NUMBER", "1")  # see `domain.build_domain`
     told = cells = groups = None
     points: Array = np.empty((0, 3))
-    if found is not None:
-        file, boundary, regions = found
-        points, cells, groups = (
-            file.points,
-            file.cells[:, node_order(file)],
-            file.cell_groups.astype(np.int32),
-        )
+    if content is not None:
+        file, boundary, regions = content
+        points, cells = file.points, file.cells[:, node_order(file)]
+        groups = file.cell_groups.astype(np.int32)
         extent = float(np.ptp(points, axis=0).max())
         told = (
             file.kind,
@@ -138,9 +137,9 @@ def _tags_of_facets(mesh: Mesh, corners: Integers, values: Integers) -> MeshTags
     for other in (0, dimension + 1):
         mesh.topology.create_connectivity(dimension, other)
     listed = corners[here].astype(np.int64), values[here].astype(np.int32)
-    entities, found = dolfinx.io.distribute_entity_data(mesh, dimension, *listed)
+    entities, tags = dolfinx.io.distribute_entity_data(mesh, dimension, *listed)
     return dolfinx.mesh.meshtags_from_entities(
-        mesh, dimension, dolfinx.graph.adjacencylist(entities), found
+        mesh, dimension, dolfinx.graph.adjacencylist(entities), tags
     )
 
 
@@ -262,9 +261,9 @@ def _held_directions(support: Support, part: Face, places: Array) -> Array:
     normals = (
         part.normals if support.kind == "elastic" else np.broadcast_to(part.normal, places.shape)
     )
-    found: Array = share * np.eye(3) + (1 - share) * np.einsum("fi,fj->fij", normals, normals)
+    constraint: Array = share * np.eye(3) + (1 - share) * np.einsum("fi,fj->fij", normals, normals)
     if support.kind == "guided":
         around = np.cross(part.normal, places - part.centre)
         around /= np.maximum(np.linalg.norm(around, axis=1, keepdims=True), 1e-300)
-        found += np.einsum("fi,fj->fij", around, around)
-    return found
+        constraint += np.einsum("fi,fj->fij", around, around)
+    return constraint

@@ -51,7 +51,8 @@ class Face:
     def __init__(self, name: str, facets: Integers, corners: Array):
         vectors = area_vectors(corners)
         sizes, mean = np.linalg.norm(vectors, axis=1), vectors.sum(axis=0)
-        self.name, self.facets, self.corners, self.area = name, facets, corners, float(sizes.sum())
+        self.name, self.facets = name, facets
+        self.corners, self.area = corners, float(sizes.sum())
         self.places, self.normals = corners.mean(axis=1), vectors / sizes[:, None]
         self.normal = mean / max(float(np.linalg.norm(mean)), 1e-300)
         self.centre = sizes @ self.places / self.area
@@ -92,8 +93,8 @@ def boundary_of(
     index = {corners: row for row, corners in enumerate(as_rows(np.sort(facets, axis=1)))}
     for name, numbers in (*groups.items(), *others.items()):
         keys = as_rows(np.sort(file.facets[np.isin(file.facet_groups, numbers)], axis=1))
-        found: list[Any] = [index.get(key) for key in keys]
-        for key, row in zip(keys, found, strict=True):
+        indices: list[Any] = [index.get(key) for key in keys]
+        for key, row in zip(keys, indices, strict=True):
             if row is not None and owner[row] in ("", name):
                 continue
             if name in others:
@@ -109,7 +110,7 @@ def boundary_of(
                 f"{words}, the first at {format_position(file.points[list(key)].mean(axis=0))}",
             )
         else:
-            owner[found] = name
+            owner[indices] = name
     bare = owner == ""
     if bare.any() and not open_boundary:
         where, share = format_position(places[bare][0].mean(axis=0)), bare.sum()

@@ -43,7 +43,8 @@ WEDGE = "wedge"
 ALLOWED_ELEMENTS = "tetrahedra of 4 or 10 nodes, hexahedra of 8 or 27, wedges of 6"
 # By Gmsh's numbers of element types.
 GMSH_KINDS = {
-    15: "vertex", 1: "line", 8: "line3", 2: "triangle", 9: "triangle6", 3: "quad", 16: "quad8", 10: "quad9",
+    15: "vertex", 1: "line", 8: "line3",
+    2: "triangle", 9: "triangle6", 3: "quad", 16: "quad8", 10: "quad9",
     4: "tetra", 11: "tetra10", 5: "hexahedron", 12: "hexahedron27", 6: WEDGE,
 }  # fmt: skip
 # Gmsh's order of nodes, as indices into VTK's, which meshio uses:
@@ -52,7 +53,8 @@ GMSH_KINDS = {
 ORDERS = {
     "tetra10": (0, 1, 2, 3, 4, 5, 6, 7, 9, 8),
     "hexahedron27": (
-        0, 1, 2, 3, 4, 5, 6, 7, 8, 11, 16, 9, 17, 10, 18, 19, 12, 15, 13, 14, 24, 22, 20, 21, 23, 25, 26
+        0, 1, 2, 3, 4, 5, 6, 7, 8, 11, 16, 9, 17, 10, 18, 19, 12, 15, 13, 14,
+        24, 22, 20, 21, 23, 25, 26
     ),
 }  # fmt: skip
 
@@ -219,11 +221,8 @@ def arrays_msh(file: str) -> Arrays:
     if rest := _SECTION.sub(b"", data).split():
         words = b" ".join(rest[:9])[:40].decode("ascii", "replace")
         raise UnreadableFile(f"has {words!r} outside of its sections: is it truncated?")
-    is_old, number, sections = (
-        version[1] == b"2.2",
-        itertools.count(1),
-        dict(_SECTION.findall(data)),
-    )
+    is_old, number = version[1] == b"2.2", itertools.count(1)
+    sections = dict(_SECTION.findall(data))
     # Numbers of lines in a section for each number in its head. Gmsh ignores further lines.
     for name, lines in {"Nodes": (1, 2), "Elements": (1, 1), "Entities": (1, 1, 1, 1)}.items():
         head, *rows = sections.get(name.encode(), b"0").strip().splitlines()
@@ -232,7 +231,7 @@ def arrays_msh(file: str) -> Arrays:
         ):
             raise UnreadableFile(f"has other {name.lower()} than ${name} announces")
     if is_old:  # its elements have their own groups, independent of entities, and an order
-        data = _OLD_TAGS.sub(lambda found: b"%d%b%b" % (next(number), found[1], found[2]), data)
+        data = _OLD_TAGS.sub(lambda match: b"%d%b%b" % (next(number), match[1], match[2]), data)
         Path(file).write_bytes(data)  # the file is in this process's memory
     with gmsh_model("file"):
         gmsh.merge(file)
@@ -247,7 +246,7 @@ def arrays_msh(file: str) -> Arrays:
 
 def of_gmsh(by_number: bool = False) -> tuple[Array, list[Block]]:
     """Return the nodes of Gmsh's current model by number, and its elements, once for each group."""
-    model, found = gmsh.model, dict[str, list[Any]]()
+    model, parts_of_kind = gmsh.model, dict[str, list[Any]]()
     tags, places, _ = model.mesh.getNodes()
     order = np.argsort(tags)
     for dimension, entity in model.getEntities():
@@ -257,11 +256,11 @@ def of_gmsh(by_number: bool = False) -> tuple[Array, list[Block]]:
         for kind, numbers, nodes in zip(*model.mesh.getElements(dimension, entity), strict=True):
             name = GMSH_KINDS.get(kind) or model.mesh.getElementProperties(kind)[0]
             rows = np.searchsorted(tags, nodes, sorter=order).reshape(len(numbers), -1)
-            found.setdefault(name, []).extend(
+            parts_of_kind.setdefault(name, []).extend(
                 (numbers, np.full(len(rows), group), rows) for group in groups or [0]
             )
     blocks = []
-    for name, parts in found.items():
+    for name, parts in parts_of_kind.items():
         numbers, of_groups, rows = map(np.concatenate, zip(*parts, strict=True))
         chosen = np.argsort(numbers) if by_number else slice(None)
         blocks.append(Block(name, of_groups[chosen], rows[chosen]))
@@ -311,15 +310,15 @@ class Surface(NamedTuple):
 def triangles_of(path: Path) -> tuple[Surface, bytes]:
     """Read the triangles of a file, in any orientation, and the file's bytes."""
     try:
-        found, data = read_guarded(path, f"{__name__}:{path.suffix[1:].lower()}")
+        arrays, data = read_guarded(path, f"{__name__}:{path.suffix[1:].lower()}")
     except UnreadableFile as error:
         raise UnreadableFile(f"{error}; save it again in ParaView, as VTP or binary STL") from None
-    points, triangles = found.pop("points").astype(np.float64), found.pop("triangles").astype(
+    points, triangles = arrays.pop("points").astype(np.float64), arrays.pop("triangles").astype(
         np.int64
     )
     return (
         Surface(
-            points, triangles, {name.removeprefix(ARRAY): values for name, values in found.items()}
+            points, triangles, {name.removeprefix(ARRAY): values for name, values in arrays.items()}
         ),
         data,
     )
@@ -362,7 +361,8 @@ def ply(file: str) -> Arrays:
     from vtkmodules.vtkCommonCore import vtkPoints
     from vtkmodules.vtkCommonDataModel import vtkCellArray, vtkPolyData
 
-    surface, cells, corners = vtkPolyData(), vtkCellArray(), vtkPoints()
+    surface = vtkPolyData()
+    cells, corners = vtkCellArray(), vtkPoints()
     corners.SetData(numpy_to_vtk(places))
     cells.ImportLegacyFormat(numpy_to_vtkIdTypeArray(np.array(polygons, dtype=np.int64)))
     surface.SetPoints(corners)
@@ -392,13 +392,13 @@ def _ply_numbers(
         }
         if all(len(kinds) == 1 for kinds in properties.values()):
             record = np.dtype([(name, order + kind) for name, (kind,) in properties.items()])
-            found = (
+            records = (
                 np.frombuffer(body, record, abs(int(count)), at)
                 if int(count)
                 else np.empty(0, record)
             )
-            at += found.nbytes
-            points |= {name: found[name] for name in properties} if element == "vertex" else {}
+            at += records.nbytes
+            points |= {name: records[name] for name in properties} if element == "vertex" else {}
             continue
         for _ in range(int(count)):
             for name, kinds in properties.items():
@@ -439,15 +439,15 @@ def _triangulated(data: Any) -> Arrays:
     merged.SetInputConnection(triangles.GetOutputPort())
     merged.SetTolerance(0.0)  # a triangle with two equal corners becomes a line, which is ignored
     merged.Update()
-    found = merged.GetOutput()
-    if not found.GetNumberOfPolys():
+    surface = merged.GetOutput()
+    if not surface.GetNumberOfPolys():
         raise UnreadableFile("has no triangles with three different corners")
     return {
-        "points": numbers(found.GetPoints().GetData()),
-        "triangles": numbers(found.GetPolys().GetConnectivityArray()).reshape(-1, 3),
+        "points": numbers(surface.GetPoints().GetData()),
+        "triangles": numbers(surface.GetPolys().GetConnectivityArray()).reshape(-1, 3),
         **{
             ARRAY + name: values
-            for name, values in vtk_arrays(found.GetPointData()).items()
+            for name, values in vtk_arrays(surface.GetPointData()).items()
             if values.ndim == 1
         },
     }
@@ -457,8 +457,8 @@ def vtk_arrays(data: Any) -> Arrays:
     """Return the arrays of points or cells by name."""
     from vtkmodules.util.numpy_support import vtk_to_numpy as numbers
 
-    found = (data.GetArray(k) for k in range(data.GetNumberOfArrays()))
-    return {one.GetName(): numbers(one) for one in found if one is not None and one.GetName()}
+    arrays = (data.GetArray(k) for k in range(data.GetNumberOfArrays()))
+    return {one.GetName(): numbers(one) for one in arrays if one is not None and one.GetName()}
 
 
 # ---------------------------------------------------------------- meshes of bodies
@@ -470,7 +470,7 @@ def read_mesh(path: Path, tags: str | None = None, surfaces: Sequence[Path] = ()
         stats = [file.stat() for file in (path, *surfaces)]
         if any(file.is_dir() for file in (path, *surfaces)):
             raise UnreadableFile("is a folder; a mesh is a file")
-        changed = tuple((found.st_mtime_ns, found.st_size) for found in stats)
+        changed = tuple((status.st_mtime_ns, status.st_size) for status in stats)
         return _read(path, tags, tuple(surfaces), changed)
     except FileNotFoundError as error:
         raise UnreadableFile(f"no such file: {error.filename}") from None
@@ -494,12 +494,12 @@ def _read(
     blocks = [
         Block(kind, groups, np.asarray(rows, dtype=np.int64)) for (kind, rows), groups in of_blocks
     ]
-    found = assembled(
+    mesh_file = assembled(
         points, blocks, {dimension: names[dimension] for dimension in (2, 3)}, mesh.data
     )
     for surface in surfaces:
-        found = _with_surface(found, surface)
-    return found
+        mesh_file = _with_surface(mesh_file, surface)
+    return mesh_file
 
 
 SAME_NODE = 1e-3  # distance of equal nodes over a triangle's shortest side; files have 7 digits
@@ -602,12 +602,12 @@ def split_quads(nodes: Integers) -> Integers:
 def _split(points: Array, block: Block) -> Block:
     """Split wedges of boundary layers, and the quadrilaterals next to them."""
     if block.kind == WEDGE:
-        found = split_wedges(block.nodes)
-        sides = points[found[:, :, 1:]] - points[found[:, :, :1]]
+        tetrahedra = split_wedges(block.nodes)
+        sides = points[tetrahedra[:, :, 1:]] - points[tetrahedra[:, :, :1]]
         # All tetrahedra of a wedge are reordered or none, so that an invalid wedge stays invalid.
         turned = np.linalg.det(sides).sum(axis=1) < 0
-        found[turned] = found[turned][:, :, [0, 2, 1, 3]]
-        return Block("tetra", np.repeat(block.groups, 3), found.reshape(-1, 4))
+        tetrahedra[turned] = tetrahedra[turned][:, :, [0, 2, 1, 3]]
+        return Block("tetra", np.repeat(block.groups, 3), tetrahedra.reshape(-1, 4))
     if block.kind == "quad":
         return Block("triangle", np.repeat(block.groups, 2), split_quads(block.nodes))
     return block
@@ -696,7 +696,7 @@ def gmsh_text(
         *groups,
     ]
     lines += ["$EndPhysicalNames"]
-    for section, found in (("Nodes", places), ("Elements", rows)):
-        listed = (f"{number} {row}" for number, row in enumerate(found, start=1))
-        lines += [f"${section}", str(len(found)), *listed, f"$End{section}"]
+    for section, entries in (("Nodes", places), ("Elements", rows)):
+        listed = (f"{number} {row}" for number, row in enumerate(entries, start=1))
+        lines += [f"${section}", str(len(entries)), *listed, f"$End{section}"]
     return "\n".join([*lines, ""])

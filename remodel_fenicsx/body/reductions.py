@@ -51,8 +51,8 @@ def _swept(levels: Array, elements: Integers) -> Body:
     """Connect the same mesh at positions (levels, nodes, 3) by elements of one more dimension."""
     near = np.arange(len(levels) - 1)[:, None, None] * levels.shape[1] + elements
     far = near + levels.shape[1]
-    found = np.concatenate([near, far[..., ::-1] if elements.shape[1] == 2 else far], axis=-1)
-    return _shared(levels.reshape(-1, 3), found.reshape(-1, 2 * elements.shape[1]))
+    connected = np.concatenate([near, far[..., ::-1] if elements.shape[1] == 2 else far], axis=-1)
+    return _shared(levels.reshape(-1, 3), connected.reshape(-1, 2 * elements.shape[1]))
 
 
 def _between(low: Array, high: Array) -> Array:
@@ -212,15 +212,17 @@ def choice(scene: ReducedScene) -> Choice:
     # Under compressive loads no reduction is selected, because a body that buckles leaves the
     # symmetry.
     reductions = scene.geometry.reductions  # the cheapest first
-    found = {name: objections(scene, name) for name in reductions}
+    reasons_by_name = {name: objections(scene, name) for name in reductions}
     if scene.model.kinematics != AUTO:
-        return Choice(scene.model.kinematics, found)
+        return Choice(scene.model.kinematics, reasons_by_name)
     if buckling_risks(scene):
-        return Choice("full", found)
+        return Choice("full", reasons_by_name)
     exact = (
-        name for name, reasons in found.items() if not reasons and not is_for_means(scene, name)
+        name
+        for name, reasons in reasons_by_name.items()
+        if not reasons and not is_for_means(scene, name)
     )
-    return Choice(next(exact, "full"), found)
+    return Choice(next(exact, "full"), reasons_by_name)
 
 
 def objections(scene: ReducedScene, name: str) -> list[str]:
@@ -258,12 +260,12 @@ def for_means(scene: ReducedScene) -> str:
     """Return the cheapest kinematics that is right for means over many random seeds, or `auto`."""
     if buckling_risks(scene):
         return AUTO
-    found = (
+    suitable = (
         name
         for name in scene.geometry.reductions
         if is_for_means(scene, name) and not objections(scene, name)
     )
-    return next(found, AUTO)
+    return next(suitable, AUTO)
 
 
 def describe_choice(scene: ReducedScene) -> list[str]:
@@ -322,7 +324,10 @@ def too_many_elements(scene: ReducedScene) -> str:
     largest = math.floor(
         math.exp(math.log(refinement) - (math.log(number) - math.log(LARGEST_MESH)) / dimension)
     )
-    return f"must be at most {largest} for a {scene.geometry.name}: more makes over {LARGEST_MESH:g} elements"
+    return (
+        f"must be at most {largest} for a {scene.geometry.name}: "
+        f"more makes over {LARGEST_MESH:g} elements"
+    )
 
 
 def step_cost(scene: ReducedScene, name: str) -> float:

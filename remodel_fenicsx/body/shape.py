@@ -10,7 +10,7 @@ from abc import abstractmethod
 from collections.abc import Callable, Collection, Container, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
-from operator import methodcaller
+from operator import attrgetter, methodcaller
 from pathlib import Path
 from typing import Any, ClassVar, Literal, NamedTuple, TYPE_CHECKING
 
@@ -83,7 +83,8 @@ class Column:
 
     >>> from remodel_fenicsx import Simulation, preset_scene
     >>> from remodel_fenicsx.extend import COLUMNS, Column
-    >>> COLUMNS["reach"] = Column("reach", "length", "largest z", lambda m: float(m.position[:, 2].max()))
+    >>> COLUMNS["reach"] = Column(
+    ...     "reach", "length", "largest z", lambda m: float(m.position[:, 2].max()))
     >>> simulation = Simulation(preset_scene("kuhl-holzapfel-2007", "cube"))
     >>> for _, step in zip(range(1), simulation.steps()):
     ...     print(round(step.row["reach"], 4), round(step.row["mean_stretch"], 4))
@@ -138,10 +139,12 @@ def profile_weights(depth: Array) -> Array:
 
 
 def _profile(number: int, m: Any) -> float:
-    hats = m.cached("hats", lambda: profile_weights(m.state.cells.local_axes.depth))
+    cells = m.state.cells
+    hats = m.cached("hats", lambda: profile_weights(cells.local_axes.depth))
     return m.quadrature.nanmean(m.fibre_angle, hats[..., number])
 
 
+_remodeling = attrgetter("observer.stepper.remodeling")
 _PROFILE_COLUMNS = tuple(
     Column(
         name,
@@ -211,7 +214,8 @@ COLUMNS: dict[str, Column] = {
         Column(
             "remodeling_power",
             "stress length^3 / time",
-            "energy per time that the pass of this step releases (docs/theory.md, Power of remodeling)",
+            "energy per time that the pass of this step releases (docs/theory.md, "
+            "Power of remodeling)",
             lambda m: m.step.remodeling_power,
             after_pass=True,
         ),
@@ -242,7 +246,7 @@ COLUMNS_ON_REQUEST: dict[str, Column] = {
             "pass_residual",
             "squared link length",
             "distance of the cells from equilibrium with their stress: largest norm of A_pass - A",
-            lambda m: m.observer.stepper.remodeling.distance(),
+            lambda m: _remodeling(m).distance(),
             after_pass=True,
         ),
         Column(
@@ -264,7 +268,7 @@ COLUMNS_ON_REQUEST: dict[str, Column] = {
             "asleep_share",
             "",
             "inactive fraction of the volume, below remodeling.threshold",
-            lambda m: m.observer.stepper.remodeling.inactive_fraction(),
+            lambda m: _remodeling(m).inactive_fraction(),
             by_case=False,
         ),
         *(
@@ -372,10 +376,10 @@ def columns_of(
     known = {column.name for column in (*always, *others)}
     on_request = columns_on_request(shape, regions, held)
     extra = (on_request[name] for name in requested if name not in known)
-    found = (*always, *(chosen or others), *extra)
-    differ = [column for column in found if column.by_case and not column.after_pass]
+    columns = (*always, *(chosen or others), *extra)
+    differ = [column for column in columns if column.by_case and not column.after_pass]
     return (
-        *found,
+        *columns,
         *(column.of_case(number) for number in range(2, cases + 1) for column in differ),
     )
 
@@ -395,8 +399,8 @@ def columns_on_request(
         for face in held
         if re.fullmatch(NAME, face)
     ]
-    found = (*shape.columns_on_request, *of_regions, *of_supports)
-    return COLUMNS_ON_REQUEST | {column.name: column for column in found}
+    requestable = (*shape.columns_on_request, *of_regions, *of_supports)
+    return COLUMNS_ON_REQUEST | {column.name: column for column in requestable}
 
 
 SUPPORT_FORCE = "force of the support on the face `{}`, along the face's mean outward normal"
@@ -448,7 +452,8 @@ class LoadKind:
     >>> def add_weight(shape, loading, name):
     ...     weight = loading.magnitude(name)
     ...     loading.add_term(lambda u, v: -weight * v[2] * loading.weight * ufl.dx)
-    >>> per_volume = Dimension("force per volume", "9.81 kN/m^3", ((STRESS_UNIT, 1), (LENGTH_UNIT, -1)))
+    >>> units = ((STRESS_UNIT, 1), (LENGTH_UNIT, -1))
+    >>> per_volume = Dimension("force per volume", "9.81 kN/m^3", units)
     >>> Cube.loads["weight"] = LoadKind(add_weight, "weight along z", per_volume)
     >>> heavy = {"loads": {"weight": {"value": 0.02, "ramp": [[0.0, 0.0], [2.0, 1.0]]}}}
     >>> preset_scene("kuhl-holzapfel-2007", "cube").with_values(heavy).loads["weight"].value
@@ -505,8 +510,9 @@ _Is: Any = with_key(
     "is",
     Literal["unloaded", "loaded"],
     default="unloaded",
-    description="State of the geometry: without loads, or (tube, user-supplied body) under the loads "
-    "at the end of their ramps; the unloaded body is then computed (docs/tissue_that_lives.md).",
+    description="State of the geometry: without loads, or (tube, user-supplied body) under the "
+    "loads at the end of their ramps; the unloaded body is then computed "
+    "(docs/tissue_that_lives.md).",
 )
 
 
@@ -566,7 +572,8 @@ class Shape(_Is):  # type: ignore[misc]
     >>> from remodel_fenicsx.extend import LENGTH, Shape
     >>> class Bar(Shape):
     ...     shape: Literal["bar"] = "bar"
-    ...     length: Annotated[float, LENGTH] = Field(default=4.0, gt=0, description="Length along z.")
+    ...     length: Annotated[float, LENGTH] = Field(
+    ...         default=4.0, gt=0, description="Length along z.")
     ...
     ...     def build(self, mesh, comm=None):
     ...         raise NotImplementedError("a script builds a mesh here and returns a Domain")
@@ -659,8 +666,8 @@ class Shape(_Is):  # type: ignore[misc]
         coordinates
             Reference positions, (..., 3), in the unit of length.
         """
-        found: Any = coordinates[..., 2] / self.axial_length
-        return found
+        station: Any = coordinates[..., 2] / self.axial_length
+        return station
 
     def local_axes(self, domain: Domain, quadrature: Quadrature) -> LocalAxes:
         """Return axes, depth and station at quadrature points, by default functions of position.
@@ -672,13 +679,13 @@ class Shape(_Is):  # type: ignore[misc]
         quadrature
             Quadrature of the domain.
         """
-        places = quadrature.coordinates
+        places, geometry = quadrature.coordinates, domain.mesh.geometry
         return LocalAxes(
             places,
             lambda: self.axes_at(places),
             lambda: self.depth(places),
             lambda: self.station(places),
-            lambda: self.depth(domain.mesh.geometry.x.astype(np.float64)),
+            lambda: self.depth(geometry.x.astype(np.float64)),
         )
 
     def unresolved(self, mesh: Mesh, columns: Collection[str]) -> list[str]:
@@ -904,9 +911,9 @@ class FromFile(Shape):
 
 def check_lengths(shape: Shape, lengths: dict[str, float]) -> None:
     """Check that Gmsh can mesh a body of these lengths, or raise the fault at its key."""
-    found = mesh_length_problem(lengths)
-    if found is not None:
-        raise validation_error(found[1], found[0], getattr(shape, found[0]))
+    problem = mesh_length_problem(lengths)
+    if problem is not None:
+        raise validation_error(problem[1], problem[0], getattr(shape, problem[0]))
 
 
 def axial_dead_force(face: str) -> LoadKind:

@@ -30,7 +30,8 @@ if TYPE_CHECKING:
     from remodel_fenicsx.body.loading import Loading
 
 # The paper's numbers of elements: around, along a side of the core, rings, along.
-AROUND, CORE, RINGS, ALONG = 16, 4, 2, 10
+AROUND, CORE = 16, 4
+RINGS, ALONG = 2, 10
 # Position of the core's corners over the radius, and roundness of its sides from straight (0) to
 # round (1). Smallest scaled Jacobian of the hexahedra: 0.86 (refinement 1), 0.83 (2), 0.81 (4).
 CORE_RADIUS, CORE_ROUNDNESS = 0.65, 0.4
@@ -41,8 +42,8 @@ class Tendon(Shape):
 
     Length and square root of the area: 1e-6 to 1e6, one up to 10,000 times the other.
 
-    Its keyword arguments are the keys of `[geometry]`: `length` and `area` in the unit `length_unit`, or in any
-    one unit.
+    Its keyword arguments are the keys of `[geometry]`: `length` and `area` in the unit
+    `length_unit`, or in any one unit.
 
     Raises
     ------

@@ -59,14 +59,11 @@ PAPER = (16, 8, 12)  # the paper's elements around, through the wall, and along
 def build_in_half_plane(
     dimension: int, scene: ReducedScene, comm: MPI.Intracomm | None = None
 ) -> Domain:
-    """Mesh the wall on the x axis (1) or in the half-plane y = 0, x > 0 (2), with the body's elements there."""
+    """Mesh the wall with the body's elements on the x axis (1) or in the half-plane y = 0 (2)."""
     from remodel_fenicsx.body.domain import lattice_domain
 
-    shape, degree, counts = (
-        scene.geometry,
-        scene.mesh.degree,
-        _counts(scene.mesh)[1 : dimension + 1],
-    )
+    shape, degree = scene.geometry, scene.mesh.degree
+    counts = _counts(scene.mesh)[1 : dimension + 1]
     wall = shape.wall(counts[0], scene.regions)
     along = [np.linspace(0.0, shape.length, degree * count + 1) for count in counts[1:]] or [
         np.zeros(1)
@@ -249,14 +246,16 @@ def _elongation(m: Any) -> float:
 
 def _of_the_end(name: str, m: Any) -> float:
     """Return `wall_force` or `reduced` of an `EndForce`."""
-    return float(getattr(m.end_force("inner"), name)(m.state.loading.values.get("pressure", 0.0)))
+    loads = m.state.loading.values
+    return float(getattr(m.end_force("inner"), name)(loads.get("pressure", 0.0)))
 
 
 def _opening_angle(m: Any) -> float:
     """Compute the opening angle of the unloaded tube with its current cells. Collective."""
     from remodel_fenicsx.model.residual_stress import Rings, cut, means_through
 
-    cells, state, stepper, comm = m.state.cells, m.state, m.observer.stepper, m.state.comm
+    state, stepper = m.state, m.observer.stepper
+    cells, comm = state.cells, state.comm
     local, tissue = cells.local_axes, stepper.remodeling.parameters.largest()  # numbers
     axes = local.axes.reshape(-1, 3, 3)
 
@@ -296,10 +295,11 @@ def _opening_angle(m: Any) -> float:
 
 def _elements_through(domain: Domain, degree: int) -> tuple[Array, Array]:
     """Return radii of element boundaries on the x axis, and radii that separate Gauss points."""
-    nodes = domain.comm.bcast(domain.gather_nodes(domain.mesh.geometry.x))
+    geometry = domain.mesh.geometry
+    nodes = domain.comm.bcast(domain.gather_nodes(geometry.x))
     off, size = np.abs(nodes[:, 1:]).max(axis=1), np.abs(nodes).max()
     radii = np.sort(nodes[(off < 1e-9 * size) & (nodes[:, 0] > 0), 0])
-    edges = radii[:: domain.mesh.geometry.cmap.degree]
+    edges = radii[:: geometry.cmap.degree]
     shares = np.cumsum(np.polynomial.legendre.leggauss(degree + 1)[1][:-1]) / 2
     return edges, np.sort(np.append(edges, edges[:-1, None] + np.diff(edges)[:, None] * shares))
 
@@ -311,8 +311,8 @@ class Tube(RoundWall):
     (`supports.ends`). Inner radius, wall thickness and length: 1e-6 to 1e6, one up to 10,000 times
     the other.
 
-    Its keyword arguments are the keys of `[geometry]`: `inner_radius`, `outer_radius` and `length` in the unit
-    `length_unit`, or in any one unit.
+    Its keyword arguments are the keys of `[geometry]`: `inner_radius`, `outer_radius` and `length`
+    in the unit `length_unit`, or in any one unit.
 
     Raises
     ------
@@ -437,7 +437,7 @@ class Tube(RoundWall):
                 warn_of_twist(face, support, loading.domain.comm)
 
     def wall(self, elements: int, regions: Regions) -> Wall:
-        """Return its wall with so many elements through it."""
+        """Return the layered wall with this number of elements through it."""
         return Wall.from_regions(self.inner_radius, self.outer_radius, elements, regions)
 
     @model_validator(mode="after")
@@ -561,7 +561,8 @@ class Tube(RoundWall):
 
 
 def whole_tube(
-    shape: Tube, counts: tuple[int, int, int], element: str, degree: int, comm: MPI.Intracomm | None = None,
+    shape: Tube, counts: tuple[int, int, int], element: str, degree: int,
+    comm: MPI.Intracomm | None = None,
     regions: Regions | None = None, quarters: int = 4,
 ) -> Domain:  # fmt: skip
     """Mesh a tube with these elements around (a multiple of 4), through the wall and along.

@@ -85,27 +85,28 @@ def check_layers(inner_radius: float, outer_radius: float, elements: int, region
         key, radius = f"regions.{name}.outer_radius", _outer(region, outer_radius)
         if not inner_radius < radius <= outer_radius:
             inner, outer = format_value(inner_radius), format_value(outer_radius)
-            rule = f"must be greater than geometry.inner_radius = {inner}, at most outer_radius = {outer}"
-            raise validation_error(rule, key, radius)
+            rule = f"must be greater than geometry.inner_radius = {inner}"
+            raise validation_error(f"{rule}, at most outer_radius = {outer}", key, radius)
         if radius in seen:
-            rule = f"regions.{seen[radius]} also ends at {format_value(radius)}; outer radii must differ"
-            raise validation_error(rule, key, region.outer_radius)
+            rule = f"regions.{seen[radius]} also ends at {format_value(radius)}"
+            raise validation_error(f"{rule}; outer radii must differ", key, region.outer_radius)
         seen[radius] = name
     if regions and outer_radius not in seen:
         last = seen[max(seen)]
-        rule = f"must be geometry.outer_radius = {format_value(outer_radius)} or omitted: outermost region"
+        outer = f"geometry.outer_radius = {format_value(outer_radius)}"
+        rule = f"must be {outer} or omitted: outermost region"
         raise validation_error(rule, f"regions.{last}.outer_radius", max(seen))
     if len(regions) > elements:
-        rule = f"{len(regions)} regions, {elements} elements through the wall; increase mesh.refinement"
-        raise validation_error(rule, "regions", None)
+        rule = f"{len(regions)} regions, {elements} elements through the wall"
+        raise validation_error(f"{rule}; increase mesh.refinement", "regions", None)
     for inside, radius in itertools.pairwise([inner_radius, *sorted(seen)]):
         key = f"regions.{seen[radius]}.outer_radius"
         if (
-            found := mesh_length_problem(
+            problem := mesh_length_problem(
                 {key: radius - inside, "geometry.outer_radius": outer_radius}
             )
         ) is not None:
-            raise validation_error(f"the layer is {found[1]}", key, radius)
+            raise validation_error(f"the layer is {problem[1]}", key, radius)
 
 
 # ---------------------------------------------------------------- stress-free configurations
@@ -115,16 +116,18 @@ def check_layers(inner_radius: float, outer_radius: float, elements: int, region
 def prestretch(natural: Natural, local_axes: LocalAxes, domain: Domain) -> Array:
     """Return the layers' three stretches at the points, (elements, points, 3)."""
     depth = local_axes.depth
-    found = np.ones((*depth.shape, 3))
+    stretches = np.ones((*depth.shape, 3))
     for layer in natural.layers:
         if layer.region is not None:
-            found[domain.element_region == domain.regions[layer.region]] = (
+            stretches[domain.element_region == domain.regions[layer.region]] = (
                 layer.prestretch.stretches
             )
         else:
             low, high = layer.share
-            found[(depth >= low) & ((depth < high) | (high == 1.0))] = layer.prestretch.stretches
-    return found
+            stretches[(depth >= low) & ((depth < high) | (high == 1.0))] = (
+                layer.prestretch.stretches
+            )
+    return stretches
 
 
 def gradient(stretches: Array, axes: Array) -> Array:
@@ -195,7 +198,10 @@ def columns_on_request(means: Mapping[str, tuple[str, AngleOf]]) -> Columns:
 
 
 FACES = ("inner", "outer")
-FITTED_TO_FACE = "mean over the face: fitted through two layers of elements (docs/what_may_go_wrong.md, Stress at faces)"
+FITTED_TO_FACE = (
+    "mean over the face: fitted through two layers of elements "
+    "(docs/what_may_go_wrong.md, Stress at faces)"
+)
 ON_THE_FACE = 1e-6  # normalised depth within the rounding of coordinates
 SECOND_LAYER = 1.5  # depth over layer thickness, between the start of the second and third layer
 
@@ -217,10 +223,8 @@ def _fitted_to_face(face: str, m: Any) -> Array:
 
     quadrature, comm = m.quadrature, m.domain.comm
     inner, outer = (m.cached(("area", name), lambda name=name: m.face_area(name)) for name in FACES)
-    widening, depths = (
-        outer / inner - 1,
-        m.state.cells.local_axes.nodal_depth[geometry_dofmap(m.domain.mesh)],
-    )
+    local_axes, widening = m.state.cells.local_axes, outer / inner - 1
+    depths = local_axes.nodal_depth[geometry_dofmap(m.domain.mesh)]
     if face == "outer":
         widening, depths = inner / outer - 1, 1 - depths
     depths = quadrature.owned(depths)
@@ -300,12 +304,12 @@ class RoundWall(Walled, WithRegions, Unloads):
 
     @abstractmethod
     def wall(self, elements: int, regions: Regions) -> Wall:
-        """Return its wall with so many elements through it."""
+        """Return the layered wall with this number of elements through it."""
 
     def layers_of_tissue(
         self, natural: Natural, regions: Regions, tissues: Mapping[str, Tissue]
     ) -> Any:
-        """Return where tissue or prestretch change (`model.residual_stress.Layer`), from the lumen outwards."""
+        """Return layers of one tissue and prestretch, `model.residual_stress.Layer`, outwards."""
         from remodel_fenicsx.model.residual_stress import UNSTRETCHED, Layer
 
         wall = self.wall(len(regions), regions)
@@ -314,7 +318,7 @@ class RoundWall(Walled, WithRegions, Unloads):
         for layer in natural.layers:
             edges |= {inner + share * (outer - inner) for share in layer.share}
         apart = [a for a, b in itertools.pairwise(sorted(edges)) if b - a > 1e-9 * outer] + [outer]
-        found = []
+        layers = []
         for low, high in itertools.pairwise(apart):
             middle = (low + high) / 2
             region = wall.names[int(np.searchsorted(wall.radii[1:-1], middle))]
@@ -328,14 +332,14 @@ class RoundWall(Walled, WithRegions, Unloads):
                     else layer.region == region
                 )
             ]
-            found.append(
+            layers.append(
                 Layer(
                     (low, high),
                     tissues[region if region in tissues else ""],
                     (*of_layer, UNSTRETCHED)[0],
                 )
             )
-        return found
+        return layers
 
     def covers_body(self, regions: Collection[str]) -> bool:
         """Return whether there are regions; the outermost one ends at the outer radius."""

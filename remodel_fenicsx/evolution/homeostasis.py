@@ -222,8 +222,8 @@ class Homeostasis:
             for process, change in zip(self.remodels, changes, strict=True):
                 process.follow(change, factor, time, residual)
             soon = state.time + 1 / self.stepper.slowest
-            equilibrium = partial(coupling.solve_equilibrium, soon, loads, again=True)  # type: ignore[attr-defined]
-            outcome = attempted(equilibrium, StepFailure)
+            solve = coupling.solve_equilibrium  # type: ignore[attr-defined]
+            outcome = attempted(partial(solve, soon, loads, again=True), StepFailure)
             if isinstance(outcome, StepFailure):
                 log.info("extrapolation of the path stopped: %s", outcome)
                 state.restore(before)

@@ -50,7 +50,8 @@ class Remodels:
     simulation:
 
     >>> from remodel_fenicsx import Simulation, preset_scene
-    >>> [part.name for part in Simulation(preset_scene("kuhl-holzapfel-2007", "cube")).stepper.remodels]
+    >>> simulation = Simulation(preset_scene("kuhl-holzapfel-2007", "cube"))
+    >>> [part.name for part in simulation.stepper.remodels]
     ['cells']
     """
 

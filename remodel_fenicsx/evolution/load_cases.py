@@ -44,7 +44,7 @@ class FurtherCase(LoadCaseSolver):
         state.stop_signal = lambda: stepper.state.stop_signal()
 
     def solve(self, time: float, again: bool) -> Work:
-        """Solve for equilibrium at `time` with the present cells; see `Staggered.solve_equilibrium`."""
+        """Solve for equilibrium with the present cells; see `Staggered.solve_equilibrium`."""
         return self.coupling.solve_equilibrium(time, self.load_values(time), again)
 
     def drive(self) -> Drive:

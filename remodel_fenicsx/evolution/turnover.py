@@ -344,7 +344,7 @@ FAR_FROM_REST = 0.01  # smallest change of ln m or ln rho per turnover time that
 
 
 class UnboundedGrowth(WarnsOnce):
-    """Warning at the end of a run whose turnover rates decay no faster than 1/t (`DecayMonitor`)."""
+    """Warning at the end of a run if turnover rates decay no faster than 1/t (`DecayMonitor`)."""
 
     name, initial = "growth", DecayMonitor.INITIAL
 
@@ -378,5 +378,6 @@ class UnboundedGrowth(WarnsOnce):
             f"{100 * rate * period:.2g} % in remodeling.turnover.time, most at "
             f"{self.quadrature.shown_place_of_largest(rates)}, and the rates have decayed no "
             f"faster than 1/t since time {self.held_from + self._numbers['early_time']:g} "
-            "(mechanobiological instability, docs/tissue_that_lives.md). Try a larger remodeling.turnover.gain"
+            "(mechanobiological instability, docs/tissue_that_lives.md). "
+            "Try a larger remodeling.turnover.gain"
         )

@@ -92,7 +92,7 @@ class PMultigrid:
         matrix.PtAP(self._prolongation, result=self._coarse)
 
     def destroy(self) -> None:
-        """Free PETSc's objects."""
+        """Free the objects of PETSc."""
         self._options.close()
         self._coarse.destroy()
 
@@ -230,7 +230,8 @@ def coefficient(mesh: Mesh, name: str, value: float | Constant | Function) -> Co
 def point_values(value: Constant | Function, quadrature: Quadrature) -> NDArray[np.float64]:
     """Return a coefficient's values at the quadrature points, (elements, points), with ghosts."""
     if isinstance(value, dolfinx.fem.Function):
-        dofs = value.function_space.dofmap.list.reshape(-1)
+        dofmap = value.function_space.dofmap
+        dofs = dofmap.list.reshape(-1)
         # One value per point, also DG0 with one point per element.
         if dofs.size == np.prod(quadrature.shape):
             return quadrature.values(value, ()).copy()
@@ -305,13 +306,13 @@ def second_derivative(energy: ufl.Form, unknown: Function, test: Expr, trial: Ex
 
 
 def _of_density(density: Expr, unknown: Function, test: Expr, trial: Expr) -> Expr:
-    found = invariants(density, unknown)
-    if not found:
+    scalars = invariants(density, unknown)
+    if not scalars:
         return ufl.derivative(ufl.derivative(density, unknown, test), unknown, trial)
-    by_number = [(ufl.variable(invariant), invariant) for invariant in found]
+    by_number = [(ufl.variable(invariant), invariant) for invariant in scalars]
     function = ufl.replace(density, {invariant: number for number, invariant in by_number})
     changes = [
-        [ufl.derivative(invariant, unknown, way) for invariant in found] for way in (test, trial)
+        [ufl.derivative(invariant, unknown, way) for invariant in scalars] for way in (test, trial)
     ]
     total = ufl.as_ufl(0)
     for (number, _), change in zip(by_number, changes[0], strict=True):
@@ -329,7 +330,7 @@ def invariants(density: Expr, unknown: Function) -> list[Expr]:
     for part in unique_post_traversal(density):  # operands come before their results
         if part == unknown or any(operand in depends for operand in part.ufl_operands):
             depends.add(part)
-    found: dict[Expr, None] = {}
+    scalars: dict[Expr, None] = {}
     stack, seen = [density], set()
     while stack:
         part = stack.pop()
@@ -337,14 +338,14 @@ def invariants(density: Expr, unknown: Function) -> list[Expr]:
             continue
         seen.add(part)
         if part.ufl_shape == () and isinstance(part, (Inner, Determinant, Trace)):
-            found[part] = None
+            scalars[part] = None
         elif isinstance(part, Sqrt):
-            found[part.ufl_operands[0]] = None
+            scalars[part.ufl_operands[0]] = None
         elif part.ufl_operands:
             stack.extend(reversed(part.ufl_operands))
         else:
             return []
-    return list(found)
+    return list(scalars)
 
 
 # ---------------------------------------------------------------- matrices

@@ -177,7 +177,8 @@ def expression(
         ufl_expression[place] if place else ufl_expression
         for place in np.ndindex(ufl_expression.ufl_shape)
     ]
-    parts, sizes, comm = [], [], extract_unique_domain(ufl_expression).ufl_cargo().comm
+    parts, sizes = [], []
+    comm = extract_unique_domain(ufl_expression).ufl_cargo().comm
     while flat:
         size = next(size for size in SIMD_COMPONENTS if size <= len(flat))
         part, flat = as_vector(flat[:size]), flat[size:]
@@ -192,7 +193,8 @@ class PointValues:
     """Compiled expression at reference points of elements, in kernels of some components each."""
 
     def __init__(self, parts: list[dolfinx.fem.Expression], sizes: list[int], points: int):
-        self._parts, self._sizes, self._points = parts, sizes, points
+        self._parts, self._sizes = parts, sizes
+        self._points = points
         self.components = sum(sizes)
 
     def eval(self, mesh: Mesh, elements: NDArray[np.int32]) -> NDArray[np.float64]:

@@ -20,7 +20,8 @@ if TYPE_CHECKING:
     from dolfinx.mesh import Mesh
     from ufl.core.expr import Expr
 
-ufl, basix_ufl, fem = Late("ufl"), Late("basix.ufl"), Late("dolfinx.fem")
+ufl, basix_ufl = Late("ufl"), Late("basix.ufl")
+fem = Late("dolfinx.fem")
 Array = NDArray[np.float64]
 
 
@@ -289,7 +290,7 @@ class RadialKinematics(_Reduced):
             self.axial_strain = _constant(mesh, 0.0)
 
     def unknown(self, mesh: Mesh, degree: int) -> Function:
-        """Return u_r, zero."""
+        """Return the radial displacement u_r, zero."""
         return lagrange(mesh, degree, ())
 
     def displacement(self, unknown: Function) -> Expr:
@@ -423,7 +424,8 @@ class NaturalConfiguration(_KinematicsWrapper):
         closing: Any = None,
         initial: Expr | None = None,
     ):
-        self.field, self.gradient, self.closing = kinematics, gradient, closing
+        self.field, self.gradient = kinematics, gradient
+        self.closing = closing
         self.initial, self.grows = (gradient, False) if initial is None else (initial, True)
 
     def elastic(self, deformation_gradient: Expr) -> Expr:
@@ -496,12 +498,10 @@ class FreeLength(_KinematicsWrapper):
         """Return e/length, the same on every rank. Collective."""
         from mpi4py import MPI
 
-        dofs = unknown.function_space.sub(1).dofmap.list.flatten()
+        space = unknown.function_space
+        dofs = space.sub(1).dofmap.list.flatten()
         here = float(unknown.x.array[dofs[0]]) if len(dofs) else -np.inf
-        return (
-            float(unknown.function_space.mesh.comm.allreduce(here, MPI.MAX))
-            / self.body.axial_length
-        )
+        return float(space.mesh.comm.allreduce(here, MPI.MAX)) / self.body.axial_length
 
 
 def global_constant_space(space: FunctionSpace, component: int) -> FunctionSpace:

@@ -270,10 +270,12 @@ class Quadrature:
 
     def superconvergent_from_nodes(self, values: NDArray[np.float64]) -> NDArray[np.float64]:
         """Interpolate nodal values (elements, nodes) to the superconvergent points."""
-        functions = shape_functions(
-            self.element_kind, self.mesh.geometry.cmap.degree, self._superconvergent_points
-        )
-        return np.asarray(values @ functions[0].T)
+        return np.asarray(values @ self._node_functions(self._superconvergent_points).T)
+
+    def _node_functions(self, points: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return the geometry's shape functions at points of an element, (points, nodes)."""
+        geometry = self.mesh.geometry
+        return shape_functions(self.element_kind, geometry.cmap.degree, points)[0]
 
     @cached_property
     def _superconvergent_points(self) -> NDArray[np.float64]:
@@ -292,8 +294,7 @@ class Quadrature:
     @cached_property
     def _extrapolation(self) -> NDArray[np.float64]:
         """Matrix from values at an element's points to those at its nodes, (nodes, points)."""
-        functions = shape_functions(self.element_kind, self.mesh.geometry.cmap.degree, self.points)
-        return np.asarray(np.linalg.pinv(functions[0]))
+        return np.asarray(np.linalg.pinv(self._node_functions(self.points)))
 
     def _means_at_nodes(self, values: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return nodal means by volume of values (owned elements, nodes or 1, n). Collective."""
@@ -321,7 +322,7 @@ class Quadrature:
         if owned.size:
             at = np.unravel_index(int(np.argmax(owned)), owned.shape)
             local = (float(owned[at]), tuple(self.coordinates[at].tolist()))
-        return max(allgather(self.mesh.comm, local), key=lambda found: found[0])[1]
+        return max(allgather(self.mesh.comm, local), key=lambda largest: largest[0])[1]
 
     def shown_place_of_largest(self, values: NDArray[np.float64]) -> str:
         """Return the reference position of the largest value as text. Collective."""

@@ -116,7 +116,8 @@ REMOVED = {"exact": "was removed; use 'lagged', or 'direct' for a new tangent in
 # Lagged factorisations, the fastest first. Each but the last requires properties of the tangent and
 # may fail.
 # By CHOLMOD, and by MUMPS.
-DEFINITE, SYMMETRIC, GENERAL = "Cholesky factorisation", "LDL^T factorisation", "LU factorisation"
+DEFINITE, SYMMETRIC = "Cholesky factorisation", "LDL^T factorisation"
+GENERAL = "LU factorisation"
 FACTOR_OPTIONS: dict[str, Mapping[str, object]] = {
     DEFINITE: {
         "pc_type": "cholesky",
@@ -285,14 +286,14 @@ class ProblemOptions:
 
     def _users_options(self) -> dict[str, str]:
         """Return the options `remodel_...` of command line and PETSC_OPTIONS, without prefix."""
-        found = {}
+        options = {}
         for name, value in self._database.getAll().items():
             key = name.removeprefix(USERS_PREFIX)
             if key != name and not key[:1].isdigit():
                 # Marks it as used: PETSc does not report it as left over.
                 self._database.hasName(name)
-                found[key] = value
-        return found
+                options[key] = value
+        return options
 
     def _was_used(self, name: str) -> bool:
         answer = ctypes.c_int(0)  # petsc4py lacks this function

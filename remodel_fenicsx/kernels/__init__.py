@@ -60,9 +60,9 @@ def source(name: str, numbers: Mapping[str, float] = NO_NUMBERS) -> str:
     # The text holds everything that decides the machine code, because it names the library in the
     # cache.
 
-    def included(found: re.Match[str]) -> str:
-        following = found.string.count("\n", 0, found.end()) + 1
-        return f'{source(found[1])}#line {following} "{name}"\n'
+    def included(match: re.Match[str]) -> str:
+        following = match.string.count("\n", 0, match.end()) + 1
+        return f'{source(match[1])}#line {following} "{name}"\n'
 
     text = re.sub(
         r'^#include "(.+)"\n',
@@ -168,7 +168,8 @@ class CompiledPointKernels(PointKernels):
         """Compute by Jacobi's method; numpy computes the points that this leaves open."""
         tensors, previous = np.asarray(tensors), np.asarray(previous)
         n, limit = len(tensors), np.broadcast_to(threshold, len(tensors))
-        values, axes, left_open = np.empty((n, 3)), np.empty((n, 3, 3)), np.empty(n, np.uint8)
+        values, axes = np.empty((n, 3)), np.empty((n, 3, 3))
+        left_open = np.empty(n, np.uint8)
         given = tensors, previous, tolerance, limit, spectral.MIN_OVERLAP
         if self._call("principal", n, *given, values, axes, left_open):
             # Numpy raises an error that names the first such point.

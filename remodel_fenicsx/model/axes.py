@@ -176,7 +176,8 @@ def fibres_problem(measured: Mapping[str, Array]) -> str | None:
     """Return the first error in measured fibres, (n, columns) by name of `MEASURED`, or None."""
     sources = [name for name in FIBRE_INPUTS if name in measured]
     if len(sources) != 1:
-        return f"has {' and '.join(sources) or 'none'} of {', '.join(FIBRE_INPUTS)}; exactly one is needed"
+        given = " and ".join(sources) or "none"
+        return f"has {given} of {', '.join(FIBRE_INPUTS)}; exactly one is needed"
     for name, values in measured.items():
         if values.shape[1] not in MEASURED[name]:
             numbers = " or ".join(map(str, MEASURED[name]))
@@ -203,8 +204,9 @@ def fibres_problem(measured: Mapping[str, Array]) -> str | None:
         eigenvalues = np.linalg.eigvalsh(_tensors(measured[source]))
         trace = eigenvalues.sum(axis=1)
         if not (valid := (trace > 0) & (eigenvalues[:, 0] >= -FILE_ROUNDING * trace)).all():
-            return _row(source, valid, f"has eigenvalues {', '.join(f'{v:.3g}' for v in eigenvalues[~valid][0])}; "
-                        "none may be below 0, nor all be 0")  # fmt: skip
+            first = ", ".join(f"{value:.3g}" for value in eigenvalues[~valid][0])
+            rule = "none may be below 0, nor all be 0"
+            return _row(source, valid, f"has eigenvalues {first}; {rule}")
     return None
 
 

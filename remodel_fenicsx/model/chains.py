@@ -74,7 +74,7 @@ NO_VALUES: Mapping[str, UflOrArray] = MappingProxyType({})
 
 @with_old_names
 class WithParameters:
-    """Component whose functions may take additional parameters by keyword (`with_parameters` binds them)."""
+    """Component whose functions may take additional parameters, which `with_parameters` binds."""
 
     functions: ClassVar[tuple[str, ...]]
     parameters: Mapping[str, Parameter]

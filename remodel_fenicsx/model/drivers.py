@@ -40,9 +40,11 @@ class Driver:
 
     >>> import ufl
     >>> from remodel_fenicsx.extend import DRIVERS, Driver
-    >>> DRIVERS["kirchhoff"] = Driver(lambda F, stresses: ufl.det(F) * stresses.cauchy, material=False)
+    >>> DRIVERS["kirchhoff"] = Driver(
+    ...     lambda F, stresses: ufl.det(F) * stresses.cauchy, material=False)
     >>> from remodel_fenicsx import preset_scene
-    >>> preset_scene("kuhl-holzapfel-2007", "cube").with_values({"remodeling.driver": "kirchhoff"}).remodeling.driver
+    >>> scene = preset_scene("kuhl-holzapfel-2007", "cube")
+    >>> scene.with_values({"remodeling.driver": "kirchhoff"}).remodeling.driver
     'kirchhoff'
     >>> del DRIVERS["kirchhoff"]
     """

@@ -70,7 +70,8 @@ class Matrix:
 
     >>> import numpy as np
     >>> from remodel_fenicsx.extend import MATRICES, Matrix, neo_hookean
-    >>> MATRICES["quadratic"] = Matrix(lambda J, lame_lambda, mu: lame_lambda / 2 * (J - 1) ** 2, *neo_hookean.others)
+    >>> MATRICES["quadratic"] = Matrix(
+    ...     lambda J, lame_lambda, mu: lame_lambda / 2 * (J - 1) ** 2, *neo_hookean.others)
     >>> float(MATRICES["quadratic"](np.eye(3), 27.293, 3.103))
     0.0
     >>> del MATRICES["quadratic"]
@@ -272,7 +273,8 @@ def log_sum(
 
 def total_structure_tensor(cells: Sequence[UnitCell]) -> Array:
     """Return A of one cell or of weighted cells, (n, 3, 3); the weights are numbers."""
-    return sum(cell.weight * structure_tensor(cell.dimensions, cell.axes) for cell in cells)  # type: ignore
+    tensors = (cell.weight * structure_tensor(cell.dimensions, cell.axes) for cell in cells)
+    return sum(tensors)  # type: ignore
 
 
 def log_derivatives(C: Array, A: Array, second: bool = True) -> tuple[Array, Array | None]:
@@ -312,7 +314,8 @@ class Repulsion(WithParameters):
     >>> from remodel_fenicsx.extend import REPULSIONS, Repulsion, squared_end_to_end_length
     >>> REPULSIONS["squared"] = Repulsion(lambda F, cells, r0: squared_end_to_end_length(F, cells))
     >>> from remodel_fenicsx import preset_scene
-    >>> preset_scene("kuhl-holzapfel-2007", "cube").with_values({"material.repulsion": "squared"}).material.repulsion
+    >>> scene = preset_scene("kuhl-holzapfel-2007", "cube")
+    >>> scene.with_values({"material.repulsion": "squared"}).material.repulsion
     'squared'
     >>> del REPULSIONS["squared"]
     """
@@ -418,8 +421,8 @@ class Tissue:
     >>> import numpy as np
     >>> from remodel_fenicsx import parts
     >>> from remodel_fenicsx.extend import UnitCell
-    >>> tissue = parts.Tissue(lame_lambda=27.293, lame_mu=3.103, network_modulus=2.0, contour_length=2.125,
-    ...                       end_to_end_length=1.0)
+    >>> tissue = parts.Tissue(lame_lambda=27.293, lame_mu=3.103, network_modulus=2.0,
+    ...                       contour_length=2.125, end_to_end_length=1.0)
     >>> cell = UnitCell(np.full(3, 3**-0.5), np.eye(3))
     >>> still, pulled = np.eye(3), np.diag([0.9, 0.9, 1.3])
     >>> W0, W = (tissue.strain_energy(F, [cell]) for F in (still, pulled))

@@ -118,7 +118,7 @@ class Drive(NamedTuple):
 
     @property
     def floor(self) -> Array | float:
-        """Tension at which the switch is one half, (n,) or a number (`tensor_law.switch_threshold`)."""
+        """Tension at which the switch is 1/2, (n,) or a number (`tensor_law.switch_threshold`)."""
         return tensor_law.switch_threshold(self.noise, self.rounding)
 
 
@@ -186,9 +186,11 @@ class Law:
     >>> from remodel_fenicsx import Simulation, preset_scene
     >>> from remodel_fenicsx.extend import LAWS, Law, UnitCell
     >>> def lost(cells, drive, time_old, time_new):
-    ...     return UnitCell(cells.dimensions * np.exp(-drive.kappas * (time_new - time_old)), cells.axes)
+    ...     decay = np.exp(-drive.kappas * (time_new - time_old))
+    ...     return UnitCell(cells.dimensions * decay, cells.axes)
     >>> LAWS["lost"] = Law(lost)
-    >>> scene = preset_scene("kuhl-holzapfel-2007", "cube").with_values({"remodeling.law": "lost", "time.end": 2.0})
+    >>> scene = preset_scene("kuhl-holzapfel-2007", "cube")
+    >>> scene = scene.with_values({"remodeling.law": "lost", "time.end": 2.0})
     >>> simulation = Simulation(scene)
     >>> for step in simulation.steps():
     ...     pass
@@ -246,7 +248,8 @@ def ranked(
     >>> def euler(l, l0, target, kappa, time_old, time_new):
     ...     return l + kappa * (time_new - time_old) * (target - l)
     >>> LAWS["euler"] = ranked(euler, has_limit=True)
-    >>> scene = preset_scene("kuhl-holzapfel-2007", "cube").with_values({"remodeling.law": "euler", "time.end": 3.0})
+    >>> scene = preset_scene("kuhl-holzapfel-2007", "cube")
+    >>> scene = scene.with_values({"remodeling.law": "euler", "time.end": 3.0})
     >>> [round(step.row["mean_fibre_angle"], 3) for step in Simulation(scene).steps()]
     [54.736, 53.554, 52.378]
     >>> del LAWS["euler"]

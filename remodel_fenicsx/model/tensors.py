@@ -239,8 +239,11 @@ def cofactor(tensors: Array) -> Array:
     """Return J F^-T of arrays (..., 3, 3); each row is the cross product of two rows of F."""
     # The copy makes nine contiguous arrays.
     (a, b, c), (d, e, f), (g, h, i) = np.moveaxis(tensors, (-2, -1), (0, 1)).copy()
-    entries = [e * i - f * h, f * g - d * i, d * h - e * g, h * c - i * b, i * a - g * c, g * b - h * a,
-               b * f - c * e, c * d - a * f, a * e - b * d]  # fmt: skip
+    entries = [
+        *(e * i - f * h, f * g - d * i, d * h - e * g),
+        *(h * c - i * b, i * a - g * c, g * b - h * a),
+        *(b * f - c * e, c * d - a * f, a * e - b * d),
+    ]
     return np.stack(entries, axis=-1).reshape(np.shape(tensors))
 
 

@@ -21,8 +21,8 @@ from remodel_fenicsx.model.energy import TURNED_OVER
 from remodel_fenicsx.model.laws import LAWS, MEANS_OF_CASES
 from remodel_fenicsx.scene.scene import Scene
 from remodel_fenicsx.schema.settings import (
-    AT_REST,
     COUPLINGS,
+    EQUILIBRIUM,
     GROWTH_COLUMNS,
     MEASURED_CELLS,
     NAME,
@@ -312,13 +312,14 @@ def growth(scene: Scene) -> Faults:
     key, start = "remodeling.turnover.from", turnover.start
     if turnover.starts_at_rest:
         if not time.is_equilibrium:
-            yield "needs time.end = 'equilibrium'; otherwise set a time", key, AT_REST
+            yield "needs time.end = 'equilibrium'; otherwise set a time", key, EQUILIBRIUM
         if scene.last_hold is None:
-            yield "needs loads.NAME.ramp with a hold before a further change", key, AT_REST
+            yield "needs loads.NAME.ramp with a hold before a further change", key, EQUILIBRIUM
         if scene.cases:
-            yield "needs a scene without [[cases]]", key, AT_REST
+            yield "needs a scene without [[cases]]", key, EQUILIBRIUM
     elif start and time.is_equilibrium:
-        yield "must be 0 or 'rest' with time.end = 'equilibrium', which has no times", key, start
+        rule = "must be 0 or 'equilibrium' with time.end = 'equilibrium', which has no times"
+        yield rule, key, start
     elif start and start > time.end:
         yield f"must be at most time.end = {format_value(time.end)}", key, start
     elif start:

@@ -638,15 +638,22 @@ COUPLINGS = {
 """Couplings by their name in a scene."""
 
 
-AT_REST = "rest"
-_Start: Any = Annotated[float, Field(ge=0)] | Literal["rest"]
+EQUILIBRIUM = "equilibrium"
+"""Value of `time.end` that requests the homeostatic state without the history, and of
+`remodeling.turnover.from`."""
+
+_Start: Any = Annotated[
+    Annotated[float, Field(ge=0)] | Literal["equilibrium", "rest"],  # "rest": until version 0.4.0
+    AfterValidator(lambda start: EQUILIBRIUM if start == "rest" else start),
+]
 _WithStart: Any = with_key(
     "from",
     Annotated[Any, GetPydanticSchema(lambda _, handler: handler(_Start))],
     default=0.0,
-    json_schema_extra={"allowed": "a finite number of at least 0, or 'rest'"},
-    description="Time from which turnover adds volume; a step ends there. 0: always. 'rest', with "
-    "time.end = 'equilibrium': from the equilibrium under the loads before their last change.",
+    json_schema_extra={"allowed": "a finite number of at least 0, or 'equilibrium'"},
+    description="Time from which turnover adds volume; a step ends there. 0: always. "
+    "'equilibrium', with time.end = 'equilibrium': from the steady state under the loads before "
+    "their last change. The older name 'rest' means the same.",
 )
 
 
@@ -680,7 +687,7 @@ class Turnover(_WithStart):  # type: ignore[misc]
     @property
     def starts_at_rest(self) -> bool:
         """Whether growth starts from a homeostatic state on the load path."""
-        return bool(getattr(self, "from") == AT_REST)
+        return bool(getattr(self, "from") == EQUILIBRIUM)
 
     @property
     def start(self) -> float:
@@ -1082,10 +1089,6 @@ def faces_of(loads: Mapping[str, object]) -> dict[str, OnFace]:
         for name, load in tables.items()
         if isinstance(load.get("face"), str)
     }
-
-
-EQUILIBRIUM = "equilibrium"
-"""Value of `time.end` that requests the homeostatic state without the history."""
 
 
 _End: Any = Annotated[float, Field(gt=0)] | Literal["equilibrium"]

@@ -41,9 +41,9 @@ from remodel_fenicsx.state import StateNumbers, State
 log = logging.getLogger(__name__)
 
 MAX_DISPLACEMENT_RATIO = 2.0
-"""`Solution.displacement_ratio` above which a step is repeated in substeps. The paper's bodies have at most
-1.25. A tube without chains that approaches its largest pressure in one step has 2.9, a jump over a
-limit point 3.9 and more."""
+"""`Solution.displacement_ratio` above which a step is repeated in substeps. The paper's bodies have
+at most 1.25. A tube without chains that approaches its largest pressure in one step has 2.9, a jump
+over a limit point 3.9 and more."""
 # A reach below CLOSE after more than MANY iterations (or tangents of a whole step) may be a jump.
 # Chains near their contour length have a small reach too, but need at most 11 iterations.
 CLOSE, MANY = 0.5, 12
@@ -80,7 +80,8 @@ class Work(SolverCounts):
         """Add the work of a solve, or of a rejected step."""
         self.count(done)
         if isinstance(done, Solution):
-            self.residual, self.extension, self.last = done.residual, done.extension, done
+            self.residual, self.extension = done.residual, done.extension
+            self.last = done
 
 
 class StepFailure(RemodelError, RuntimeError):
@@ -127,7 +128,8 @@ class StepFailure(RemodelError, RuntimeError):
 
     def __init__(self, time: float, text: str, refusal: FailureCause):
         super().__init__(text)
-        self.time, self.refusal, self.kept = time, refusal, "every finished step is kept"
+        self.time, self.refusal = time, refusal
+        self.kept = "every finished step is kept"
 
     def in_words(self) -> str:
         """Return position, reason, advice, and the saved part of the run.
@@ -179,13 +181,14 @@ class Continuation:
         done, attempts = 0.0, 0
         if failure is not None:
             part = self._bisect(part, done, failure, work)
+        vector = self.state.unknown.x
         while done < 1.0:
             attempts += 1
             self.state.tell(
                 f"t = {self.time:g}, {100 * done:.3g} % of {self.stage}, "
                 f"attempt {attempts}: {100 * part:.2g} %"
             )
-            before = self.state.unknown.x.array.copy()
+            before = vector.array.copy()
             part = min(part, 1.0 - done, self.largest_part(done))
             is_last = done + part > 1.0 - 1e-12
             self.set_fraction(1.0 if is_last else done + part)
@@ -195,16 +198,14 @@ class Continuation:
             )
             work.add(solution)
             if isinstance(solution, SolveFailure):
-                self.state.unknown.x.array[:] = before
+                vector.array[:] = before
                 part = self._bisect(part, done, solution, work)
             else:
                 expected = 0.0 if self._direction is None else part * self._size(self._direction)
-                moved = self._size(self.state.unknown.x.array - before)
+                moved = self._size(vector.array - before)
                 if self.is_another_branch(solution, moved, expected) and self._may_check_jumps():
-                    solved, self.state.unknown.x.array[:] = (
-                        self.state.unknown.x.array.copy(),
-                        before,
-                    )
+                    solved = vector.array.copy()
+                    vector.array[:] = before
                     if part / 2 >= self._smallest:
                         log.debug(
                             "%s: far from the last substep, %.3g of the first Newton step",
@@ -217,24 +218,24 @@ class Continuation:
                     refusal = diagnose_failure(self.newton, None, self._direction)
                     self._warn_of_jump(solved, refusal if refusal.kind else SEVERAL_SOLUTIONS)
                     self.set_fraction(1.0 if is_last else done + part)
-                    self.state.unknown.x.array[:] = solved
+                    vector.array[:] = solved
                 done = 1.0 if is_last else done + part
-                self._direction = (self.state.unknown.x.array - before) / part
+                self._direction = (vector.array - before) / part
                 part *= 2
                 work.substeps += 1
 
     def check_for_jump(self, before: NDArray[np.float64], work: Work, again: bool) -> bool:
-        """Repeat a step in substeps if it may have jumped. Return whether it was. Collective."""
+        """Repeat a step in substeps if it may have jumped. Return True if so. Collective."""
         # `again`: the same step was solved before, with other cells.
-        unknown, jumps = self.state.unknown.x.array, self._jumps
-        moved, last = self._size(unknown - before), jumps["moved"]
+        vector, jumps = self.state.unknown.x, self._jumps
+        moved, last = self._size(vector.array - before), jumps["moved"]
         tangents, expected = work.tangents if work.substeps == 1 else 0, 0.0 if again else last
         looked = (
             self.is_another_branch(work.last, moved, expected, tangents) and self._may_check_jumps()
         )
         if looked:
             self.repeat_in_substeps(before, work)
-            moved = self._size(unknown - before)
+            moved = self._size(vector.array - before)
         jumps["moved"] = max(moved, last) if again else moved
         return looked
 
@@ -242,31 +243,31 @@ class Continuation:
         """Repeat a step in substeps from the unknowns before it. Collective."""
         # The solution stays if the substeps fail, with a warning if the branch ends there. If they
         # lead to another solution, that one is used, because the body reaches it.
-        unknown = self.state.unknown.x.array
-        found, parts = unknown.copy(), Work()
+        vector = self.state.unknown.x
+        unknown = vector.array
+        solution, parts = unknown.copy(), Work()
         unknown[:] = before
         failure = attempted(lambda: self.advance(parts, part=0.5), StepFailure)
         leads_on = failure is None and self.refusal is None
         if failure is not None:
             if self.refusal is None and failure.refusal.kind in END_OF_PATH:
-                self._warn_of_jump(found, failure.refusal)
+                self._warn_of_jump(solution, failure.refusal)
             log.info(
                 "time %g: solution far from the tangent's prediction, and its substeps failed: %s",
                 self.time,
                 failure,
             )
         work.count(parts)
-        if leads_on and self._size(unknown - found) > SAME_SOLUTION * self._size(found - before):
+        if leads_on and self._size(unknown - solution) > SAME_SOLUTION * self._size(
+            solution - before
+        ):
             log.info(
                 "time %g: several solutions exist; using the one reached by substeps", self.time
             )
-            work.residual, work.extension, work.substeps = (
-                parts.residual,
-                parts.extension,
-                parts.substeps,
-            )
+            work.residual, work.extension = parts.residual, parts.extension
+            work.substeps = parts.substeps
             return
-        unknown[:] = found
+        unknown[:] = solution
         self.set_fraction(1.0)
 
     @property
@@ -279,7 +280,8 @@ class Continuation:
         """Return whether a solve may have jumped: far from its tangent, slow, or too far."""
         # `expected`: distance predicted by the last substep, 0 if unknown; `tangents`: number of a
         # whole step.
-        least = POSSIBLE_JUMP * self.state.loading.domain.size
+        domain = self.state.loading.domain
+        least = POSSIBLE_JUMP * domain.size
         if tangents > MANY or 0.0 < expected < moved / FASTER and moved > least:
             return True
         if solution is None:
@@ -305,7 +307,8 @@ class Continuation:
         """Warn of a jump from the end of a branch, the present state, to `solved`. Collective."""
         self.refusal = refusal
         self._jumps["found"] += 1
-        state, far = self.state, self._size(solved - self.state.unknown.x.array)
+        state, vector = self.state, self.state.unknown.x
+        far = self._size(solved - vector.array)
         if state.comm.rank == 0:
             loads = ", ".join(
                 f"{name} {value:.4g}" for name, value in state.loading.values.items() if value
@@ -320,8 +323,8 @@ class Continuation:
         if part / 2 < self._smallest:
             text = self.state.label + failure_text(self.time, self.stage, done, failure)
             self.set_fraction(done)  # the last solved state
-            found = diagnose_failure(self.newton, failure, self._direction)
-            refusal = found if found.kind or self.refusal is None else self.refusal
+            cause = diagnose_failure(self.newton, failure, self._direction)
+            refusal = cause if cause.kind or self.refusal is None else self.refusal
             raise StepFailure(self.time, text, refusal) from failure
         log.debug("%s: %s; next substep %g", self.stage, failure.reason, part / 2)
         return part / 2
@@ -335,7 +338,8 @@ class CellHomotopy:
     # access.
 
     def __init__(self, state: State, tissue: Tissue, settings: Solver):
-        self.state, self.tissue, self.settings = state, tissue, settings
+        self.state, self.tissue = state, tissue
+        self.settings = settings
         self.theta = dolfinx.fem.Constant(state.cells.quadrature.mesh, PETSc.ScalarType(0.0))
 
     @functools.cached_property
@@ -359,7 +363,7 @@ class CellHomotopy:
         return GuardedNewton(self.equilibrium, self.settings, robust=True)
 
     def close(self) -> None:
-        """Free PETSc's objects."""
+        """Free the objects of PETSc."""
         if "newton" in vars(self):
             vars(self).pop("newton").close()
 

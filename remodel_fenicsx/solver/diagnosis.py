@@ -316,11 +316,11 @@ def diagnose_failure(
         )
     inertia = Inertia(newton.equilibrium)
     try:
-        found = _of_the_tangent(inertia, direction)
+        cause = _of_the_tangent(inertia, direction)
         # The residual may be near the tolerance beyond a limit point too, at a remote state.
-        if failure is None or found.kind == LIMIT_POINT.kind:
-            return found
-        return _of_the_tolerance(failure) or found
+        if failure is None or cause.kind == LIMIT_POINT.kind:
+            return cause
+        return _of_the_tolerance(failure) or cause
     except FactorisationFailed as reason:
         log.info("the cause of the failed step could not be determined: %s", reason)
         return TOO_LARGE
@@ -332,20 +332,20 @@ def _of_the_tolerance(failure: SolveFailure) -> FailureCause | None:
     """Return advice on the tolerance if the residual is close to it, otherwise None."""
     if not 1.0 < failure.residual_over_tolerance < NEARLY_SOLVED:
         return None
-    found = replace(
+    cause = replace(
         SOLVER_TOLERANCE,
         finding=f"the residual is {failure.residual_over_tolerance:.3g} times the tolerance",
     )
     if failure.relative_residual > MAX_ADVISED_TOLERANCE:
-        return found
+        return cause
     # Twice, because it varies between iterations.
     enough = 10.0 ** np.ceil(np.log10(2 * failure.relative_residual))
     key = f"solver.relative_tolerance = {enough:g}"
     if failure.stagnates:
         return replace(
-            found, advice=f"the residual stagnates at rounding errors; {key} accepts this state"
+            cause, advice=f"the residual stagnates at rounding errors; {key} accepts this state"
         )
-    return replace(found, advice=f"{found.advice}; {key} would accept this state")
+    return replace(cause, advice=f"{cause.advice}; {key} would accept this state")
 
 
 def _of_the_tangent(inertia: Inertia, direction: NDArray[np.float64] | None) -> FailureCause:

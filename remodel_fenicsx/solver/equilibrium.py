@@ -51,7 +51,8 @@ class PointwiseRepulsion:
     """Second Piola-Kirchhoff stress of the repulsion, and stiffness, as quadrature functions."""
 
     def __init__(self, state: State, tissue: Tissue, cells: Sequence[UnitCell], shares: Shares):
-        self.state, self.shares, self.quadrature = state, shares, state.cells.quadrature
+        self.state, self.shares = state, shares
+        self.quadrature = state.cells.quadrature
         self._parameters = state.parameters(tissue)
         self.tissue = self._parameters.compiled
         self.stress = self.quadrature.function("repulsion_stress", (3, 3))
@@ -191,7 +192,8 @@ class Equilibrium:
         self.comm = mesh.comm
         self.parameters = state.parameters(tissue)
         self.tissue, self._point_shares = self.parameters.tissue, point_shares
-        u, shares, loading = state.unknown, shares or [state.cells.symbolic_cell], state.loading
+        u, loading = state.unknown, state.loading
+        shares = shares or [state.cells.symbolic_cell]
         test, trial = ufl.TestFunction(u.function_space), ufl.TrialFunction(u.function_space)
         F = state.kinematics.elastic_gradient(u)
         self.energies = state.dilatation.energies(
@@ -271,7 +273,8 @@ class Equilibrium:
         """Return whether J vanishes on the straight path between two states. Collective."""
         # |F^-1| <= F:F / (2 det F), and no matrix within 1 / |F^-1| of F is singular. So few points
         # need the exact check.
-        F, G, J = before.gradients, after.gradients, before.jacobians.ravel()
+        F, G = before.gradients, after.gradients
+        J = before.jacobians.ravel()
         change, own = (np.einsum("nij,nij->n", each, each) for each in (G - F, F))
         at = np.flatnonzero((J <= 0.0) | (np.sqrt(change) * own >= 2.0 * J))
         turns = at.size > 0 and bool(determinant_changes_sign(F[at], G[at]).any())
@@ -294,11 +297,9 @@ class Equilibrium:
         shape = self.quadrature.shape
         if self.tissue.chain is None:
             return np.zeros(shape)
-        F = self.state.elastic_gradient()
+        F, cells = self.state.elastic_gradient(), self.state.cells
         if self._point_shares is None:
-            return self.state.cells.kernels.squared_length(F, self.state.cells.point_cells).reshape(
-                shape
-            )
+            return cells.kernels.squared_length(F, cells.point_cells).reshape(shape)
         return np.asarray(squared_end_to_end_length(F, self._point_shares())).reshape(shape)
 
     def locking_length(self) -> NDArray[np.float64]:
@@ -360,14 +361,16 @@ class Equilibrium:
 
     def prescribed_values(self) -> NDArray[np.float64]:
         """Return prescribed values of this rank's unknowns with ghosts; NaN for free unknowns."""
-        values = np.full_like(self.state.unknown.x.array, np.nan)
+        vector = self.state.unknown.x
+        values = np.full_like(vector.array, np.nan)
         for condition in self.state.loading.boundary_conditions:
             condition.set(values)
         return values
 
     def prescribed_gap(self) -> float:
         """Return the largest difference of an unknown from its prescribed value. Collective."""
-        gap = np.abs(self.prescribed_values() - self.state.unknown.x.array)
+        vector = self.state.unknown.x
+        gap = np.abs(self.prescribed_values() - vector.array)
         return float(allreduce(self.comm, float(np.nanmax(gap, initial=0.0)), MPI.MAX))
 
 

@@ -58,7 +58,7 @@ class LimitedMemoryUpdate:
         self._last = None
 
     def improve(self, x: Vec, residual: Vec, step: Vec) -> bool:
-        """Improve the step H r (trial: x - step) in place. Return whether it was. Collective."""
+        """Improve the step H r (trial: x - step) in place. Return True if so. Collective."""
         now = np.array([x.array_r, residual.array_r, step.array_r])
         if self._last is not None:
             pair = now - self._last
@@ -140,12 +140,13 @@ class LaggedFactorisation:
         return taken
 
     def close(self) -> None:
-        """Free PETSc's objects."""
+        """Free the objects of PETSc."""
         if self.preconditioner is not None:
             self.preconditioner.destroy()
         if self._options is not None:
             self._options.close()
-        self.preconditioner, self._options, self._kind = None, None, ""
+        self.preconditioner, self._options = None, None
+        self._kind = ""
 
     def _was_indefinite(self) -> bool:
         """Return whether MUMPS has counted negative pivots in its LDL^T factorisation."""
@@ -258,7 +259,8 @@ class FullNewton:
     keeps = False  # whether a factorisation is reused in later solves
 
     def __init__(self, equilibrium: Equilibrium, snes: SNES, matrix: Mat, options: ProblemOptions):
-        self.equilibrium, self.snes, self.matrix, self.options = equilibrium, snes, matrix, options
+        self.equilibrium, self.snes = equilibrium, snes
+        self.matrix, self.options = matrix, options
         self.tangents = 0
         self._always = False  # whether nothing is reused between iterations
 
@@ -301,7 +303,7 @@ class FullNewton:
 
     @property
     def iteration_factor(self) -> int:
-        """Factor on solver.maximum_iterations."""
+        """Factor on the key solver.maximum_iterations."""
         return 1
 
     @contextmanager

@@ -50,7 +50,8 @@ INTERMEDIATE_TOLERANCE = 1e-5
 # If r/L exceeds the first number, the rounding error of one point may exceed the second one times
 # the nodal forces. A residual below it is then accepted only if it exceeds the third one times the
 # residual before.
-NEARLY_STRAIGHT, COARSE, STAGNATION = 0.99, 1e-8, 0.25
+NEARLY_STRAIGHT, COARSE = 0.99, 1e-8
+STAGNATION = 0.25
 
 
 class Convergence:
@@ -157,18 +158,16 @@ class SolveFailure(RuntimeError, SolverCounts):
     def __init__(
         self,
         reason: str,
-        found: Solution,
+        solution: Solution,
         residual_over_tolerance: float = np.inf,
         relative_residual: float = np.inf,
         stagnates: bool = False,
     ):
         super().__init__(reason)
-        self.reason, self.extension, self.stagnates = reason, found.extension, stagnates
-        self.residual_over_tolerance, self.relative_residual = (
-            residual_over_tolerance,
-            relative_residual,
-        )
-        self.count(found)
+        self.reason, self.extension = reason, solution.extension
+        self.stagnates, self.relative_residual = stagnates, relative_residual
+        self.residual_over_tolerance = residual_over_tolerance
+        self.count(solution)
 
 
 @dataclass
@@ -210,10 +209,12 @@ class GuardedNewton:
     """Newton's method with guards, from the present unknowns; see `close`. Collective."""
 
     def __init__(self, equilibrium: Equilibrium, settings: Solver, robust: bool = False):
-        self.equilibrium, self.settings, self._robust = equilibrium, settings, robust
+        self.equilibrium, self.settings = equilibrium, settings
+        self._robust = robust
         self.unknown = equilibrium.state.unknown
-        self._values = self.unknown.x.array
-        self._x = self.unknown.x.petsc_vec.duplicate()
+        vector = self.unknown.x
+        self._values = vector.array
+        self._x = vector.petsc_vec.duplicate()
         self._residual, self._external, self._trial = (self._x.duplicate() for _ in range(3))
         self._matrix = equilibrium.create_matrix()
         self.convergence = Convergence(equilibrium, settings)
@@ -223,16 +224,9 @@ class GuardedNewton:
 
     def _make_solver(self) -> None:
         """Create PETSc's objects of the method, which serve all steps."""
-        equilibrium, settings, kinematics = (
-            self.equilibrium,
-            self.settings,
-            self.equilibrium.state.kinematics,
-        )
-        unknowns, ranks, narrow = (
-            self._x.getSize(),
-            equilibrium.comm.size,
-            not kinematics.three_dimensional,
-        )
+        equilibrium, settings = self.equilibrium, self.settings
+        kinematics, unknowns = equilibrium.state.kinematics, self._x.getSize()
+        ranks, narrow = equilibrium.comm.size, not kinematics.three_dimensional
         self.method = method = resolve_auto(
             settings.method, unknowns, narrow, kinematics.suits_multigrid
         )
@@ -281,7 +275,10 @@ class GuardedNewton:
         self._snes = None
 
     def solve(self, origin: Array | None = None, loose_tolerance: bool = False) -> Solution:
-        """Solve from the present unknowns, and set them; `loose_tolerance`: more substeps follow."""
+        """Solve from the present unknowns, and set them.
+
+        With `loose_tolerance` more substeps follow.
+        """
         self.convergence.intermediate = loose_tolerance
         first = attempted(
             lambda: self._attempt(origin, self._linear.iteration_factor), SolveFailure
@@ -321,24 +318,26 @@ class GuardedNewton:
         self._from_petsc(self._x)
         extension, norm = self.equilibrium.extension(), float(self._snes.getFunctionNorm())
         newton, linear = self._snes.getIterationNumber(), self._snes.getLinearSolveIterations()
-        found = Solution(newton, linear, self._linear.tangents - tangents, norm, extension)
+        solution = Solution(newton, linear, self._linear.tangents - tangents, norm, extension)
         if reason >= 0 and not self._present.inadmissible and extension.admissible:
             self._linear.ended(newton)
-            found.displacement_ratio = self._reach()
-            return found
+            solution.displacement_ratio = self._reach()
+            return solution
         self._values[:] = start
         if extension.stop_signal:
             raise Interrupted(extension.stop_signal)
         text = failure_text(0 if self._present.inadmissible else reason, newton, extension)
         scales = self.convergence.tolerance(), self.convergence.force_scale
         left, relative = (norm / max(scale, float(np.finfo(np.float64).tiny)) for scale in scales)
-        raise SolveFailure(text, found, left, relative, norm > STAGNATION * self._present.previous)
+        raise SolveFailure(
+            text, solution, left, relative, norm > STAGNATION * self._present.previous
+        )
 
     def _reach(self) -> float:
         """Return `Solution.displacement_ratio` of the present unknowns. Collective."""
-        comm, state, present = self.equilibrium.comm, self.equilibrium.state, self._present
+        state, present = self.equilibrium.state, self._present
         change = self._values - present.origin
-        largest = allreduce(comm, np.abs(change).max(initial=0.0), MPI.MAX)
+        largest = allreduce(state.comm, np.abs(change).max(initial=0.0), MPI.MAX)
         if not present.first_iterate or largest < POSSIBLE_JUMP * state.loading.domain.size:
             return 0.0
         return self._length(change[: state.number_of_owned_unknowns]) / present.first_iterate

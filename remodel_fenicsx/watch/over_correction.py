@@ -96,7 +96,8 @@ class OverCorrection(WarnsOnce):
     def completed(self, step: Step) -> None:
         """Check the new pass, and record it. Collective."""
         structure = to_mandel(self.state.cells.structure_tensor().reshape(-1, 3, 3)).ravel()
-        cells, known, numbers = [structure, *self._cells.values], self._cells.known, self._numbers
+        cells, known = [structure, *self._cells.values], self._cells.known
+        numbers, vector = self._numbers, self.state.unknown.x
         structures = np.reshape(cells, (len(cells), *self.quadrature.shape, 6))
         times = [step.time, *(numbers[f"time_{age}"] for age in range(ORDER + 1))]
         if known > ORDER:
@@ -104,32 +105,30 @@ class OverCorrection(WarnsOnce):
         if self.rested is not None and known:
             self.rested.compare(step, structures[0] - structures[1], times[1])
         self._cells.push(structure)
-        self._body.push(self.state.unknown.x.array)
+        self._body.push(vector.array)
         for age, time in enumerate(times[:-1]):
             numbers[f"time_{age}"] = time
 
     def _judge(self, step: Step, cells: Array, times: Array) -> None:
         """Warn of oscillations of the last passes (passes, ...), the newest first. Collective."""
-        quadrature, r0 = (
-            self.quadrature,
-            self.stepper.remodeling.parameters.largest().end_to_end_length,
-        )
+        quadrature, parameters = self.quadrature, self.stepper.remodeling.parameters
+        vector, r0 = self.state.unknown.x, parameters.largest().end_to_end_length
         scale = np.sqrt(quadrature.owned(quadrature.volumes) / quadrature.volume)[..., None] / r0**2
         of_cells = (cells[:, : len(scale)] * scale).reshape(len(cells), -1)
-        of_body = np.array([self.state.unknown.x.array, *self._body.values])[
+        of_body = np.array([vector.array, *self._body.values])[
             :, : self.state.number_of_owned_unknowns
         ]
-        of_body /= dolfinx.la.norm(self.state.unknown.x) or 1.0
+        of_body /= dolfinx.la.norm(vector) or 1.0
         cells_swing, body_swing = self._swing(times, of_cells), self._swing(times, of_body)
         self.swings = {"growing": cells_swing, "sustained": body_swing}
-        tells, found = self._is_pass_oscillation(step, cells, times), False
+        tells, overshoots = self._is_pass_oscillation(step, cells, times), False
         for (name, swing), (factor, passes) in zip(
             self.swings.items(), (GROWING, SUSTAINED), strict=True
         ):
             self._numbers[name] = self._numbers[name] + 1 if tells and swing.factor < factor else 0
             after_one_more = swing.size * abs(swing.factor)
-            found |= self._numbers[name] >= passes and after_one_more >= TOLD_SIZE
-        if found and not self.is_reported:
+            overshoots |= self._numbers[name] >= passes and after_one_more >= TOLD_SIZE
+        if overshoots and not self.is_reported:
             most = quadrature.shown_place_of_largest(
                 np.linalg.norm(_difference(times, cells), axis=-1)
             )
@@ -170,7 +169,8 @@ class OverCorrection(WarnsOnce):
         stable = 2 * share / (1 - factor)
         if share == 1.0 and stable > 0.5:
             return 'remodeling.coupling = "relaxed"'
-        return f'remodeling.coupling = "relaxed" with a relaxation_factor below {min(stable, share):.2g}'
+        factor_below = f"with a relaxation_factor below {min(stable, share):.2g}"
+        return f'remodeling.coupling = "relaxed" {factor_below}'
 
 
 class ReactivatedCells(WarnsOnce):
@@ -200,7 +200,8 @@ class ReactivatedCells(WarnsOnce):
             return
         # |change of A|^2 at the points that make up a delay.
         squares = np.where(now & (rest > 1), np.square(changes).sum(axis=-1), 0.0)
-        r0 = self.stepper.remodeling.parameters.largest().end_to_end_length
+        parameters = self.stepper.remodeling.parameters
+        r0 = parameters.largest().end_to_end_length
         if (change := np.sqrt(self.quadrature.mean(squares)) / r0**2) < RESUMED_CHANGE:
             return
         share = self.quadrature.mean((squares > 0).astype(float))

@@ -54,7 +54,7 @@ class EquilibriumStability(Watcher):
         self._numbers = StateNumbers(self.state, "stability", {"known": 0, "iterations": 0})
 
     def close(self) -> None:
-        """Free PETSc's objects."""
+        """Free the objects of PETSc."""
         self.inertia.close()
 
     # ------------------------------------------------------------ as a watcher
@@ -69,9 +69,8 @@ class EquilibriumStability(Watcher):
         work = step.work
         effort = work.tangents + OLD_FACTOR * max(0, work.newton_iterations - work.tangents)
         self._numbers["iterations"] = iterations = self._numbers["iterations"] + effort
-        factorisation = (
-            self.stepper.coupling.newton.factorisation() if step.work.newton_iterations else None
-        )
+        newton = self.stepper.coupling.newton
+        factorisation = newton.factorisation() if work.newton_iterations else None
         suspicious = factorisation is not None and self._curvature(factorisation) < 0 and known == 0
         overdue = iterations >= ITERATIONS_BETWEEN_LOOKS or (step.is_last and iterations > 0)
         if overdue and not suspicious and not self.every_step and self.unknowns > MOST_UNKNOWNS:
@@ -221,16 +220,14 @@ class BucklingWarning(WarnsOnce):
     def thrust(self) -> float:
         """Return the thrust of wall and lumen along z. Collective."""
         thrust = -self._integral(self._derivative(ALONG)) / self._length()
-        pressure = self.state.loading.values.get("pressure", 0.0)
+        loads = self.state.loading.values
+        pressure = loads.get("pressure", 0.0)
         return thrust if self.strut.inner_radius is None else thrust + pressure * self.lumen_area()
 
     def lumen_area(self) -> float:
         """Return the lumen's present area, from the mean radius of its nodes. Collective."""
-        kinematics, unknown, radius = (
-            self.state.kinematics,
-            self.state.unknown,
-            self.strut.inner_radius,
-        )
+        kinematics, unknown = self.state.kinematics, self.state.unknown
+        radius = self.strut.inner_radius
         assert radius is not None
         nodes = kinematics.nodal_space(unknown).tabulate_dof_coordinates()
         here = np.isclose(np.linalg.norm(nodes[:, :2], axis=1), radius, rtol=1e-6)
@@ -275,7 +272,8 @@ class BucklingWarning(WarnsOnce):
     def _derivative(self, *axes: int) -> Array:
         """Return central differences of W by one or two logarithmic strains, (n,). Collective."""
         # No chain reaches L.
-        room = 1 - max(0.0, self.stepper.coupling.equilibrium.extension().max_chain_extension)
+        equilibrium = self.stepper.coupling.equilibrium
+        room = 1 - max(0.0, equilibrium.extension().max_chain_extension)
         h, total = STRAINS[len(axes)] * room, np.zeros(len(self._places))
         for signs in itertools.product((1.0, -1.0), repeat=len(axes)):
             strains = np.zeros(3)

@@ -113,7 +113,8 @@ class LockingWarning(ElementWarning):
 
     def _energy_of_elongation(self) -> float:
         """Return the energy 3/2 mu e^2 of a prescribed isochoric elongation. Collective."""
-        elongation = self.stepper.state.loading.values.get("elongation", 0.0)
+        loads = self.state.loading.values
+        elongation = loads.get("elongation", 0.0)
         return (
             self.quadrature.integral(1.5 * self.stiffnesses[1] * elongation**2)
             if elongation
@@ -123,7 +124,8 @@ class LockingWarning(ElementWarning):
     def energies(self) -> tuple[float, float, float]:
         """Return energies: with mean J per element, of varying J, twice varying F. Collective."""
         quadrature, (stiffness, shear) = self.quadrature, self.stiffnesses
-        look = self.stepper.coupling.equilibrium.evaluate()
+        equilibrium = self.stepper.coupling.equilibrium
+        look = equilibrium.evaluate()
         logarithm, F = np.log(look.jacobians), look.gradients.reshape(*stiffness.shape, 9)
         inside = quadrature.polynomial_residual(0, logarithm[..., None])[..., 0]
         matrix = stiffness * (logarithm - inside) ** 2 + shear * (
@@ -140,7 +142,7 @@ class LockingWarning(ElementWarning):
         shape *= self._followed(shape, F)[:, None]
         weights = quadrature.owned(quadrature.volumes) / 2
         local = np.array([float((part * weights).sum()) for part in (matrix, volume, shape)])
-        first, second, third = self.stepper.state.comm.allreduce(local).tolist()
+        first, second, third = self.state.comm.allreduce(local).tolist()
         return first, second, third
 
     def _followed(self, shape: Array, F: Array) -> Array:
@@ -216,7 +218,8 @@ class PressureNoise(ElementWarning):
         noise = quadrature.polynomial_residual(
             quadrature.element_degree - 1, (stiffness * logarithm)[..., None]
         ).reshape(-1, 1, 1)
-        if self.stepper.remodeling.driver.material:
+        driver = self.stepper.remodeling.driver
+        if driver.material:
             quiet = tensor - noise * np.linalg.inv(F.swapaxes(1, 2) @ F)
         else:
             quiet = tensor - noise / J[:, None, None] * np.eye(3)
@@ -286,7 +289,8 @@ class VolumeLoss(WarnsOnce):
             step.findings.append((logging.INFO, self._in_words()))
 
     def _measure(self, step: Step) -> None:
-        numbers, jacobians = self._numbers, self.stepper.coupling.equilibrium.evaluate().jacobians
+        numbers, equilibrium = self._numbers, self.stepper.coupling.equilibrium
+        jacobians = equilibrium.evaluate().jacobians
         mean = self.quadrature.integral(jacobians) / self.quadrature.volume
         if mean < numbers["mean"]:
             numbers["mean"], numbers["mean_time"] = mean, step.time
@@ -300,12 +304,12 @@ class VolumeLoss(WarnsOnce):
                 numbers[name] = value
 
     def _in_words(self) -> str:
-        found = {name: self._numbers[name] for name in self.initial}
+        values = {name: self._numbers[name] for name in self.initial}
         return (
             "the tissue has lost up to {lost:.2g} % of its volume at {x:.4g}, {y:.4g}, {z:.4g} "
             "(minimum J {least:.3g}, time {least_time:g}), {whole:.2g} % overall "
             "(mean J {mean:.3g}, time {mean_time:g})"
-        ).format(lost=100 * (1 - found["least"]), whole=100 * (1 - found["mean"]), **found)
+        ).format(lost=100 * (1 - values["least"]), whole=100 * (1 - values["mean"]), **values)
 
 
 class WeakTension(WarnsOnce):
@@ -378,7 +382,7 @@ class FrontsInLayers(ShapeWarning):
         angles = self.shape.fibre_angle(
             cells.dimension_values, cells.axis_values, cells.local_axes.axes
         )
-        known, found = ~np.isnan(angles), []
+        known, jumps = ~np.isnan(angles), []
         least = np.where(known, angles, np.inf).min(axis=1)
         most = np.where(known, angles, -np.inf).max(axis=1)
         has_front = most - least > FRONT_ANGLE
@@ -392,10 +396,10 @@ class FrontsInLayers(ShapeWarning):
                 inside = (layer & has_front)[:, None]
                 low = quadrature.minimum(np.where(inside, least[:, None], np.inf))
                 high = quadrature.maximum(np.where(inside, most[:, None], -np.inf))
-                found.append(f"{name} {jump} {low:.3g} to {high:.3g} degrees")
-        if not found:
+                jumps.append(f"{name} {jump} {low:.3g} to {high:.3g} degrees")
+        if not jumps:
             return ""
         return (
-            f"{'; '.join(found)}. A front lies there, so the mean depends on the mesh; "
+            f"{'; '.join(jumps)}. A front lies there, so the mean depends on the mesh; "
             "set a larger mesh.refinement"
         )

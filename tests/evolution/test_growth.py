@@ -176,7 +176,7 @@ def test_room_from_rest_on(
 ) -> None:
     """Over the rest before, that of a wall without room; however short its loads were held."""
     before = RESTS[0.0, 1.0, 1.1, 1.0]
-    row = last_row(at_rest((volume, 1.0, 1.1, 1.5), held=100.0, turnover={"from": "rest"}))
+    row = last_row(at_rest((volume, 1.0, 1.1, 1.5), held=100.0, turnover={"from": "equilibrium"}))
     assert row["wall_thickness"] / before.wall_thickness == pytest.approx(thickness, rel=0.01)
     assert row["mean_hoop_stress"] / before.mean_hoop_stress == pytest.approx(stress, rel=0.01)
     assert row["opening_angle"] == pytest.approx(opening_angle, abs=2.0)

@@ -349,6 +349,20 @@ def test_python_says_what_toml_says():
     assert pickle.loads(pickle.dumps(built)) == built
 
 
+def test_growth_from_rest_is_growth_from_equilibrium():
+    values = {
+        "geometry": {"shape": "tube", "inner_radius": 1.0, "outer_radius": 3.0, "length": 8.0},
+        "loads": {"pressure": {"value": 4.8, "ramp": [(0, 0), (5, 1), (10, 1), (15, 1.5)]}},
+        "time": {"end": "equilibrium"},
+    }
+    now, before = (
+        Scene(name="wall", remodeling={"turnover": {"time": 40.0, "from": start}}, **values)
+        for start in ("equilibrium", "rest")
+    )
+    assert now == before
+    assert now.remodeling.turnover.starts_at_rest
+
+
 def test_a_changed_copy_is_validated():
     artery = read_scene(ROOT / "demos" / "artery.toml")
     changed_scene = artery.with_values(
