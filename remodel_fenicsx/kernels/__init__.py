@@ -26,7 +26,6 @@ import re
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
-from types import MappingProxyType
 from typing import Any
 
 import numpy as np
@@ -47,20 +46,19 @@ Array = NDArray[np.float64]
 Flags = NDArray[np.bool_]
 
 FOLDER = Path(__file__).parent
-NO_NUMBERS: Mapping[str, float] = MappingProxyType({})
 NOT_FINITE = 2  # mark of a point with NaN or infinity
 C_TYPES = {"?": "uint8_t", "B": "uint8_t", "i": "int32_t"}  # of numpy's characters; all others are double
 NUMBERS = {"CLOSE": tensors.CLOSE_EIGENVALUES, "COMPRESSION": tensor_law.COMPRESSION}
 """What tensor.c takes from Python: the numbers that tune."""
 
 
-def source(name: str, numbers: Mapping[str, float] = NO_NUMBERS) -> str:
+def source(name: str, numbers: Mapping[str, float]) -> str:
     """A C file with the files that it includes in it, after a #define for each number."""
     # One text with everything that decides the machine code: by it the library is found in the cache.
 
     def included(found: re.Match[str]) -> str:
         following = found.string.count("\n", 0, found.end()) + 1
-        return f'{source(found[1])}#line {following} "{name}"\n'
+        return f'{source(found[1], {})}#line {following} "{name}"\n'
 
     text = re.sub(r'^#include "(.+)"\n', included, (FOLDER / name).read_text(encoding="utf-8"), flags=re.MULTILINE)
     return "".join(f"#define {key} {value!r}\n" for key, value in numbers.items()) + f'#line 1 "{name}"\n{text}'
@@ -88,7 +86,7 @@ def _say_so() -> None:
 class Library:
     """The functions of a C file, which can be called with arrays."""
 
-    def __init__(self, comm: MPI.Intracomm, name: str, what: str, numbers: Mapping[str, float] = NO_NUMBERS):
+    def __init__(self, comm: MPI.Intracomm, name: str, what: str, numbers: Mapping[str, float]):
         text = source(name, numbers)
         called = "".join(f"{line};\n" for line in declarations(text))
         module = jit.library(comm, called, text, what)
@@ -135,7 +133,7 @@ class CompiledPointKernels(PointKernels):
     """The same in C. `PointKernels` says what goes in and comes out, and does what C leaves open."""
 
     def __init__(self, comm: MPI.Intracomm):
-        self._call = Library(comm, "spectral.c", "the pass")
+        self._call = Library(comm, "spectral.c", "the pass", {})
 
     def principal(
         self, tensors: ArrayLike, previous: ArrayLike, tolerance: float = spectral.AGREEMENT, threshold: ArrayLike = 0.0
@@ -188,7 +186,7 @@ class TensorKernels:
     """The law `tensor` and the repulsion `log` in C (tensor.c), on arrays of n points."""
 
     def __init__(self, comm: MPI.Intracomm):
-        self.call = Library(comm, "tensor.c", "the law for the structure tensor", numbers=NUMBERS)
+        self.call = Library(comm, "tensor.c", "the law for the structure tensor", NUMBERS)
 
     def target(self, drive: Drive) -> tensor_law.Target:
         """`laws.tensor_target`."""
