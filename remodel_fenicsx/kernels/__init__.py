@@ -26,7 +26,6 @@ import re
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
-from types import MappingProxyType
 from typing import Any
 
 import numpy as np
@@ -47,7 +46,6 @@ Array = NDArray[np.float64]
 Flags = NDArray[np.bool_]
 
 FOLDER = Path(__file__).parent
-NO_NUMBERS: Mapping[str, float] = MappingProxyType({})
 NOT_FINITE = 2  # flag of a point with NaN or infinity
 # By numpy's type character; double for all others.
 C_TYPES = {"?": "uint8_t", "B": "uint8_t", "i": "int32_t"}
@@ -55,14 +53,14 @@ NUMBERS = {"CLOSE": tensors.CLOSE_EIGENVALUES, "COMPRESSION": tensor_law.COMPRES
 """Constants that tensor.c takes from Python."""
 
 
-def source(name: str, numbers: Mapping[str, float] = NO_NUMBERS) -> str:
+def source(name: str, numbers: Mapping[str, float]) -> str:
     """Return the text of a C file with its includes, after a #define for each number."""
     # The text holds everything that decides the machine code, because it names the library in the
     # cache.
 
     def included(match: re.Match[str]) -> str:
         following = match.string.count("\n", 0, match.end()) + 1
-        return f'{source(match[1])}#line {following} "{name}"\n'
+        return f'{source(match[1], {})}#line {following} "{name}"\n'
 
     text = re.sub(
         r'^#include "(.+)"\n',
@@ -102,9 +100,7 @@ def _log_numpy_once() -> None:
 class Library:
     """Functions of a C file that can be called with arrays."""
 
-    def __init__(
-        self, comm: MPI.Intracomm, name: str, what: str, numbers: Mapping[str, float] = NO_NUMBERS
-    ):
+    def __init__(self, comm: MPI.Intracomm, name: str, what: str, numbers: Mapping[str, float]):
         text = source(name, numbers)
         called = "".join(f"{line};\n" for line in declarations(text))
         module = jit.library(comm, called, text, what)
@@ -156,7 +152,7 @@ class CompiledPointKernels(PointKernels):
     """Functions of `PointKernels` in C; numpy computes the points that C leaves open."""
 
     def __init__(self, comm: MPI.Intracomm):
-        self._call = Library(comm, "spectral.c", "the pass")
+        self._call = Library(comm, "spectral.c", "the pass", {})
 
     def principal(
         self,
@@ -219,7 +215,7 @@ class TensorKernels:
     """Law `tensor` and repulsion `log` in C (tensor.c), on arrays of n points."""
 
     def __init__(self, comm: MPI.Intracomm):
-        self.call = Library(comm, "tensor.c", "the law for the structure tensor", numbers=NUMBERS)
+        self.call = Library(comm, "tensor.c", "the law for the structure tensor", NUMBERS)
 
     def target(self, drive: Drive) -> tensor_law.Target:
         """Compute the target of `laws.tensor_target`."""

@@ -30,7 +30,7 @@ log = logging.getLogger(__name__)
 
 # ---------------------------------------------------------------- settings of a scene from coarse to fine
 DEGREES_PER_RUN = 60.0  # what angles turn by: steps of a tolerance are about so many tolerances
-STEPS = (8.0, 4.0, 2.0, 0.5, 0.25, 0.125)  # in the scene's own
+STEPS = (8.0, 5.0, 4.0, 2.5, 2.0, 0.5, 0.25, 0.125)  # in the scene's own
 TOLERANCES = (2.0, 1.0, 0.5, 0.25)  # degrees
 MESHES = [
     *product((1, 2, 4), (1, 2), (1.0, 0.25))

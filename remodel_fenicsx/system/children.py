@@ -18,6 +18,7 @@ import sys
 import sysconfig
 import types
 from collections.abc import Callable, Collection, Sequence
+from functools import partial
 from pathlib import Path
 from typing import IO, TYPE_CHECKING, Any, cast
 
@@ -38,9 +39,17 @@ class Worker:
 
     def __init__(self) -> None:
         # -P: import no module from the working folder, which may belong to somebody else.
-        command, pipe = [sys.executable, "-P", "-m", "remodel_fenicsx.cli", SERVE], subprocess.PIPE
+        command = [sys.executable, "-P", "-m", "remodel_fenicsx.cli", SERVE]
+        # SIGTERM if this process is killed. If it was killed before, the pipe has ended.
+        end_with_parent = partial(ctypes.CDLL(None).prctl, PARENT_DEATH_SIGNAL, signal.SIGTERM)
         self.process = subprocess.Popen(
-            command, env=environment_of_child(), stdin=pipe, stdout=pipe, text=True, bufsize=1
+            command,
+            env=environment_of_child(),
+            stdin=subprocess.PIPE,
+            stdout=subprocess.PIPE,
+            text=True,
+            bufsize=1,
+            preexec_fn=end_with_parent,
         )
         self._tasks, self._answers = cast(IO[str], self.process.stdin), cast(
             IO[str], self.process.stdout
@@ -100,10 +109,6 @@ def wait_for_one(workers: Collection[Worker], seconds: float) -> bool:
 
 def serve(command: Callable[[Sequence[str]], int]) -> int:
     """Run the commands that a `Worker` sends, until it closes the pipe; return the exit code."""
-    if (
-        sys.platform == "linux"
-    ):  # SIGTERM if the parent is killed; before this call standard input has ended
-        ctypes.CDLL(None).prctl(PARENT_DEATH_SIGNAL, signal.SIGTERM)
     with os.fdopen(os.dup(1), "w") as answers:
         for line in sys.stdin:
             words, messages = json.loads(line)

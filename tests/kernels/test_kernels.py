@@ -26,7 +26,7 @@ from tests.conftest import Refused
 from tests.runs import simulated
 
 ROOT = Path(__file__).parents[2]
-NUMBERS = {"spectral.c": kernels.NO_NUMBERS, "tensor.c": kernels.NUMBERS}
+NUMBERS = {"spectral.c": {}, "tensor.c": kernels.NUMBERS}
 CC = shlex.split(os.environ.get("CC", "cc"))
 
 

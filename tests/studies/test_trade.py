@@ -60,7 +60,7 @@ def test_errors_are_differences_from_the_finest_and_trusted_where_that_is_finer_
         apart = made_up(row.setting).angles - finest.angles
         assert row.angle_error == pytest.approx(trade.nanrms(apart))
         assert row.length_error == pytest.approx(np.abs(0.01 * apart[..., :2]).max(), rel=0.02)
-    doubts = {name: rows[f"radial-{name}"].doubt for name in ("1-degree-1-step-1", "2-degree-2-step-0.5",
+    doubts = {name: rows[f"radial-{name}"].doubt for name in ("1-degree-1-step-1", "2-degree-2-step-1",
               "4-degree-2-step-1", "1-degree-1-step-0.25", "4-degree-2-step-0.25")}  # fmt: skip
     shared = "the finest has no finer "
     assert [*doubts.values()][:4] == ["", "", f"{shared}elements", f"{shared}steps"]
@@ -107,7 +107,7 @@ def test_the_ladder_has_each_setting_once_and_all_can_be_run() -> None:
     assert len(named) == len(settings) > 20
     assert {setting.scene.model.kinematics for setting in settings} == {"radial", "sector", "full"}
     coarse = {name.removeprefix("radial-1-degree-1-step-") for name in named}
-    assert {"0.125", "0.25", "0.5", "1", "2", "4"} <= coarse
+    assert {"0.125", "0.25", "0.5", "1", "2.5", "5"} <= coarse
     assert {f"profile-{name}" for name in PROFILES} <= set(named)
     fast = {"model.kinematics": "radial", "time.tolerance": 1.0, "mesh.formulation": "auto"}
     assert named["profile-fast"].scene == scene.with_values(fast)
