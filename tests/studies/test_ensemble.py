@@ -90,7 +90,7 @@ def test_two_seeds_are_needed(tmp_path: Path) -> None:
         (tmp_path / f"seed-{seed}").write_text("a file of the user's\n")
     with (
         forked_children(),
-        pytest.raises(TooFewRuns, match="1 of 3 runs reached the end, .* is kept") as too_few,
+        pytest.raises(TooFewRuns, match="1 of 3 runs reached the end, .* are kept") as too_few,
     ):
         study.ensemble(pulled_cube(1.0), tmp_path, seeds=3)
     assert list(too_few.value.failed) == ["seed-2", "seed-3"] and too_few.value.exit_code == 3
