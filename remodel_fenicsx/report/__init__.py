@@ -350,9 +350,9 @@ def head(run: ReportedRun) -> Card:
 
 def tiles(run: ReportedRun) -> Card | None:
     """Show the last and first values of the shape's columns and r/L."""
-    history = run.recording.history
+    history, shape = run.recording.history, run.recording.scene.geometry
     items: list[str] = []
-    own = [column.name for column in run.recording.scene.geometry.columns]
+    own = [column.name for column in shape.columns]
     for name in run.columns:
         values, unit = history[name][np.isfinite(history[name])], run.unit(name)
         if (
