@@ -135,7 +135,7 @@ class Kept:
         angles, lengths = (
             [[row[n] for n in names] for row in asked] for names in (PROFILE, LENGTHS)
         )
-        seconds = np.array(sum(row["processor_seconds"] for row in rows))
+        seconds = np.array(sum(row["cpu_seconds"] for row in rows))
         self.keep(
             name, {"angles": np.array(angles), "lengths": np.array(lengths), "seconds": seconds}
         )

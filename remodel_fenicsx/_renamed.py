@@ -1,4 +1,4 @@
-"""Names of earlier versions: one table for modules, classes and arguments, read for one release with a warning."""
+"""Deprecated names of modules, classes and arguments, which work for one release with a warning."""
 
 from __future__ import annotations
 
@@ -66,18 +66,18 @@ OLD_NAMES: Mapping[str, Mapping[str, str]] = {
     "hold_facets": {"way": "direction"},
     "ranked": {"of_absolute_time": "depends_on_absolute_time"},
 }
-"""By module, class or function: each old name with the one that has taken its place."""
+"""Old names with their new names, by module, class or function."""
 
 
 def new_name(owner: str, old: str) -> str:
-    """Warn that a name is an old one, and return the new one."""
+    """Warn that a name is deprecated, and return the new name."""
     new = OLD_NAMES[owner][old]
     warnings.warn(f"{owner}: {old} is now {new}", DeprecationWarning, stacklevel=3)
     return new
 
 
 def with_old_arguments(owner: str, function: Wrapped) -> Wrapped:
-    """Let a function take the old names of its keyword arguments."""
+    """Return a function that accepts the old names of its keyword arguments."""
 
     @functools.wraps(function)
     def translated(*positional: object, **keywords: object) -> object:
@@ -91,7 +91,7 @@ def with_old_arguments(owner: str, function: Wrapped) -> Wrapped:
 
 
 class OldAttribute:
-    """An attribute or method under its old name."""
+    """Descriptor that gives access to an attribute or method under its old name."""
 
     def __init__(self, owner: str, old: str):
         self.owner, self.old = owner, old
@@ -101,7 +101,7 @@ class OldAttribute:
 
 
 def with_old_names(kind: Kind) -> Kind:
-    """Let a class take its old names: attributes, arguments, and methods that a subclass overrides."""
+    """Make a class accept its old names: attributes, arguments and overridden methods."""
     owner, inherit = kind.__name__, kind.__init_subclass__
 
     def overridden(subclass: type, **keywords: object) -> None:

@@ -50,7 +50,7 @@ MAX_EXTRAPOLATION = 0.5
 """Largest extrapolation of the closing's polynomials, in widths of the innermost layer.
 
 At points farther inside a thin wall the stretches are rounding errors: polynomials of degree 24
-grow by T_24(1 + 2 BEYOND) = 3e13 up to there.
+grow by T_24(1 + 2 MAX_EXTRAPOLATION) = 3e13 up to there.
 """
 ELEMENTS_OF_A_LOOK, LARGEST_LOOK = 10**5, 10**8
 """Elements of a body and bytes of a fibre file that `validate` checks in a few seconds."""
@@ -130,7 +130,8 @@ def natural_gradient(
     from remodel_fenicsx.body.wall import gradient, prestretch
     from remodel_fenicsx.model.residual_stress import close_ring
 
-    natural, shape, found = scene.natural, scene.geometry, None
+    natural, shape = scene.natural, scene.geometry
+    ring = None
     if natural.fibres:
         present, ratio = (
             field_from_files(fibres, name, quadrature, domain)
@@ -143,27 +144,24 @@ def natural_gradient(
         if layer.region is not None and layer.region not in domain.regions:
             known = ", ".join(map(repr, domain.regions))
             raise SceneError(
-                f"natural.layers[{index}].region = {layer.region!r}: no such region; there are {known}"
+                f"natural.layers[{index}].region = {layer.region!r}: no such region; "
+                f"there are {known}"
             )
     if isinstance(shape, RoundWall):
         tissues = {name: properties.tissue for name, properties in scene.properties().items()}
         try:
-            found = close_ring(
+            ring = close_ring(
                 shape.layers_of_tissue(natural, scene.regions, tissues), natural.opening_angle
             )
         except ArithmeticError as error:
-            asked = f"natural.opening_angle = {natural.opening_angle:g}"
+            angle = f"natural.opening_angle = {natural.opening_angle:g}"
             raise SceneError(
-                f"{asked}: must be smaller, or natural.layers nearer to 1: {error}"
+                f"{angle}: must be smaller, or natural.layers nearer to 1: {error}"
             ) from error
-        radii, (inner, next_one, *_) = (
-            np.linalg.norm(local_axes.coordinates[..., :2], axis=-1),
-            found.panels.edges,
-        )
-        stretches = found.stretches(radii)
-        beyond = quadrature.maximum(
-            ((inner - radii) / (next_one - inner)).reshape(quadrature.shape)
-        )
+        radii = np.linalg.norm(local_axes.coordinates[..., :2], axis=-1)
+        inner, outer, *_ = ring.panels.edges
+        stretches = ring.stretches(radii)
+        beyond = quadrature.maximum(((inner - radii) / (outer - inner)).reshape(quadrature.shape))
         if (
             beyond > MAX_EXTRAPOLATION
             or quadrature.minimum(stretches.min(axis=-1).reshape(quadrature.shape)) <= 0
@@ -174,7 +172,7 @@ def natural_gradient(
             raise SceneError(f"natural.opening_angle = {natural.opening_angle:g}: {rule}")
     else:
         stretches = prestretch(natural, local_axes, domain)
-    return gradient(stretches, local_axes.axes).reshape(*quadrature.shape, 3, 3), found
+    return gradient(stretches, local_axes.axes).reshape(*quadrature.shape, 3, 3), ring
 
 
 def check_files(scene: Scene) -> str:
@@ -253,7 +251,8 @@ def checked_domain(domain: Domain, scene: Scene) -> Domain:
     ]
     if empty:
         raise SceneError(
-            f"geometry.shape = {shape.name!r}: the mesh has no facets with the tag of {', '.join(empty)}"
+            f"geometry.shape = {shape.name!r}: the mesh has no facets with the tag of "
+            f"{', '.join(empty)}"
         )
     if not domain.comm.allreduce(bool(np.isfinite(mesh.geometry.x).all()), MPI.LAND):
         raise SceneError(f"geometry.shape = {shape.name!r}: the mesh has nodes that are not finite")
@@ -275,16 +274,16 @@ def measured_fibres(scene: Scene, domain: Domain) -> dict[str, dict[str, Array]]
     def read() -> dict[str, dict[str, Array]] | None:
         if points is None or elements is None or regions is None:
             return None
-        found = {}
+        fields = {}
         for name, cells in scene.measured_cells.items():
             chosen = (
                 regions == domain.regions[name] if name else np.ones(len(regions), dtype=np.bool_)
             )
             measured = _fibres_of(cells, name, points[elements], chosen)
-            found[name] = _with_prestretch(
+            fields[name] = _with_prestretch(
                 measured, f"{in_region(name)}cells.fibres = {cells.fibres!r}", scene
             )
-        return found
+        return fields
 
     return domain.comm.bcast(raise_on_all_ranks(domain.comm, read)) or {}
 
@@ -348,15 +347,15 @@ def _fibres_of(cells: Cells, region: str, corners: Array, chosen: Flags) -> dict
 def field_from_files(fibres: Fibres, name: str, quadrature: Quadrature, domain: Domain) -> Array:
     """Return a fibre field at the points (elements, points, ...); `INITIAL_VALUES` if absent."""
     plain = np.asarray(INITIAL_VALUES[name])
-    found = np.tile(plain, (*quadrature.shape, *(1 for _ in plain.shape)))
+    field = np.tile(plain, (*quadrature.shape, *(1 for _ in plain.shape)))
     for region, measured in fibres.items():
         if name in measured:
             chosen = (
                 domain.element_region == domain.regions[region]
                 if region
-                else np.ones(len(found), dtype=np.bool_)
+                else np.ones(len(field), dtype=np.bool_)
             )
-            found[chosen] = measured[name][domain.element_number[chosen]].reshape(
+            field[chosen] = measured[name][domain.element_number[chosen]].reshape(
                 -1, 1, *plain.shape
             )
-    return found
+    return field

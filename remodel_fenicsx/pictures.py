@@ -69,17 +69,17 @@ def grid(
 
     displacement, fields = whole.fields(time, names)
     kind = {8: pyvista.CellType.HEXAHEDRON, 4: pyvista.CellType.TETRA}[whole.elements.shape[1]]
-    found = pyvista.UnstructuredGrid({kind: whole.elements}, whole.points)
+    body = pyvista.UnstructuredGrid({kind: whole.elements}, whole.points)
     if displacement is not None:
-        found.point_data["displacement"] = displacement
+        body.point_data["displacement"] = displacement
     cells: dict[str, NDArray[Any]] = {"layer": whole.layer, **fields}
-    found.cell_data.update(cells)
-    return found if shown is None else found.extract_cells(shown)
+    body.cell_data.update(cells)
+    return body if shown is None else body.extract_cells(shown)
 
 
-def deformed(found: pyvista.UnstructuredGrid) -> pyvista.UnstructuredGrid:
+def deformed(body: pyvista.UnstructuredGrid) -> pyvista.UnstructuredGrid:
     """Displace the points of a grid, if displacements were recorded."""
-    return found.warp_by_vector("displacement") if "displacement" in found.point_data else found
+    return body.warp_by_vector("displacement") if "displacement" in body.point_data else body
 
 
 def new_plotter(**options: Any) -> pyvista.Plotter:
@@ -178,9 +178,9 @@ def render(job: Job) -> list[Pixels]:
         )
         result = file.with_suffix(".npy")
         if child.returncode != 0 or not result.exists():
-            said = f"pyvista ended with {child.returncode}: {last_line(child.stderr)}"
+            cause = f"pyvista ended with {child.returncode}: {last_line(child.stderr)}"
             raise FigureError(
-                f"rendering failed: {said}; check that xvfb and xauth are installed",
+                f"rendering failed: {cause}; check that xvfb and xauth are installed",
                 BAD_ENVIRONMENT,
             )
         return list(np.load(result))
@@ -264,7 +264,8 @@ def visible_elements(whole: WholeBody, viewing: ViewOptions) -> NDArray[np.bool_
     """Return which elements are visible: neither peeled nor cut off, (elements,)."""
     layers, count = viewing.layers, len(whole.depth)
     if layers is not None and not 1 <= layers <= count:
-        start = whole.recording.scene.geometry.depth_labels[1]
+        shape = whole.recording.scene.geometry
+        start = shape.depth_labels[1]
         rule = f"must be an integer from 1 to {count}, from the {start}"
         raise FigureError(f"layers {layers}: {rule}")
     return (whole.layer < (layers or count)) & ~_cut_off(whole, viewing.cut)
@@ -277,12 +278,12 @@ def _cut_off(whole: WholeBody, cut: str | None) -> NDArray[np.bool_]:
     middle = (whole.points.min(axis=0) + whole.points.max(axis=0)) / 2
     x, y, _ = (whole.centres - middle).T
     slack = 1e-6 * np.ptp(whole.points)  # An element that touches the plane stays.
-    found = {"half": y < -slack, "quarter": (y < -slack) & (x > slack)}
-    if cut not in found:
-        raise FigureError(f"cut {cut}: must be {' or '.join(found)}")
-    if not found[cut].any():
+    cuts = {"half": y < -slack, "quarter": (y < -slack) & (x > slack)}
+    if cut not in cuts:
+        raise FigureError(f"cut {cut}: must be {' or '.join(cuts)}")
+    if not cuts[cut].any():
         raise FigureError(f"cut {cut}: no element of this body lies completely in that part")
-    return found[cut]
+    return cuts[cut]
 
 
 # ---------------------------------------------------------------- pictures and animations as files
@@ -352,11 +353,8 @@ def _draw(
     ending: str,
 ) -> Path:
     """Draw sheets, each with some times, and write them to a new file."""
-    recording, scene, shown = (
-        whole.recording,
-        whole.recording.scene,
-        visible_elements(whole, viewing),
-    )
+    recording, shown = whole.recording, visible_elements(whole, viewing)
+    scene = recording.scene
     if ANGLE not in recording.fields(sheets[0][0], {ANGLE}):
         raise FigureError(f"{recording.path}: the run recorded no {ANGLE} (output.fields)")
     drawn = [

@@ -65,7 +65,8 @@ class Recording(RecordedRun):
         page = escape(page_of(self, NOTEBOOK_SIZE))
         # The page has no origin of its own, so that it cannot access the notebook.
         sandbox = "allow-scripts allow-downloads"
-        return f'<iframe srcdoc="{page}" sandbox="{sandbox}" style="{FRAME_STYLE}" title="report of a run"></iframe>'
+        look = f'sandbox="{sandbox}" style="{FRAME_STYLE}" title="report of a run"'
+        return f'<iframe srcdoc="{page}" {look}></iframe>'
 
     def report(self, path: Path | None = None) -> Path:
         """Write the report of the run for a browser, like `remodel-fenicsx report`.
@@ -122,10 +123,17 @@ class Recording(RecordedRun):
         return grid(WholeBody(self), self._time(time))
 
     def plot(
-        self, time: float | None = None, name: str = "fibre_angle_deformed", *, layers: int | None = None,
-        cut: str | None = None, elements: ArrayLike | None = None, chains: bool = True,
-        plotter: pyvista.Plotter | None = None, **options: object,
-    ) -> pyvista.Plotter:  # fmt: skip
+        self,
+        time: float | None = None,
+        name: str = "fibre_angle_deformed",
+        *,
+        layers: int | None = None,
+        cut: str | None = None,
+        elements: ArrayLike | None = None,
+        chains: bool = True,
+        plotter: pyvista.Plotter | None = None,
+        **options: object,
+    ) -> pyvista.Plotter:
         """Add the deformed configuration at a recorded time to a plotter of PyVista.
 
         ``recording.plot().show()`` shows it.
@@ -176,12 +184,12 @@ class Recording(RecordedRun):
                 rule = f"must be a mask of all {len(shown)}"
                 raise pictures.FigureError(f"elements of shape {np.shape(elements)}: {rule}")
             shown &= np.asarray(elements, dtype=bool)
-        found = pictures.grid(whole, self._time(time), shown)
-        if name not in found.cell_data:
-            there = ", ".join(found.cell_data)
-            raise RecordingError(f"{self.path}: no field {name!r} of elements; recorded: {there}")
+        body = pictures.grid(whole, self._time(time), shown)
+        if name not in body.cell_data:
+            fields = ", ".join(body.cell_data)
+            raise RecordingError(f"{self.path}: no field {name!r} of elements; recorded: {fields}")
         plotter = plotter or pictures.new_plotter()
-        pictures.add_body(plotter, pictures.deformed(found), name, chains, **options)
+        pictures.add_body(plotter, pictures.deformed(body), name, chains, **options)
         return plotter
 
     def screenshot(

@@ -130,14 +130,14 @@ def run(
     with interrupts.StopRequest() as stop, ExitStack() as body:
         with buffer_log(comm.rank, quiet=quiet) as held:
             scene = body.enter_context(as_unloaded(scene, comm, quiet))
-            found = comm.bcast(
+            stored = comm.bcast(
                 raise_on_all_ranks(
                     comm, lambda: _files_to_store(scene)[0] if comm.rank == 0 else {}
                 )
             )
             # A file that is replaced after this point is refused, so the stored files are those
             # that are read.
-            if sums := {key: value for key, value in found.items() if key.endswith("sha256")}:
+            if sums := {key: value for key, value in stored.items() if key.endswith("sha256")}:
                 scene = scene.with_values(sums)
             simulation = body.enter_context(_open_simulation(scene, comm))
             place = place or chosen_folder(None, scene.name, comm)
@@ -265,7 +265,8 @@ def _record(
     watchers: Sequence[Watcher] = (),
 ) -> None:
     """Run a simulation in its folder; `held` has the log records of its construction."""
-    scene, comm, state = simulation.scene, simulation.domain.mesh.comm, simulation.state
+    scene, state = simulation.scene, simulation.state
+    comm = simulation.domain.comm
     header = "as run: all values, also those of preset and defaults\n" + "\n".join(
         f"{name} {version}" for name, version in versions().items()
     )
@@ -300,7 +301,8 @@ def _record(
         ranks = "1 rank" if comm.size == 1 else f"{comm.size} ranks"
         log.info(BEGUN + "%s on %s, results in %s", scene.name, ranks, place)
         log.info("%s", scene.summary())
-        unknowns = simulation.unknown.x.petsc_vec.getSize()
+        vector = simulation.unknown.x.petsc_vec
+        unknowns = vector.getSize()
         if comm.size > 1 and unknowns < MIN_PARALLEL_UNKNOWNS:
             log.info(
                 "%d unknowns: one rank is faster than %d (docs/speed_and_accuracy.md, Ranks)",
@@ -373,12 +375,12 @@ def _files_to_store(scene: Scene) -> tuple[dict[str, object], dict[str, bytes]]:
             raise SceneError(
                 f"{key} = {cells.fibres!r}: cannot be read: {error.strerror or error}"
             ) from error
-        found = hashlib.sha256(files[name]).hexdigest()
-        if cells.fibres_sha256 not in (None, found):
+        digest = hashlib.sha256(files[name]).hexdigest()
+        if cells.fibres_sha256 not in (None, digest):
             raise SceneError(
                 f"{key} = {cells.fibres!r}: has changed: its SHA-256 was {cells.fibres_sha256}"
             )
-        changes |= {key: name, f"{key}_sha256": found}
+        changes |= {key: name, f"{key}_sha256": digest}
     return changes, files
 
 
@@ -456,10 +458,9 @@ def write_axes(scene: Scene, path: Path) -> str:
     words = [f"{domain.number_of_elements} elements"]
     if local_axes.thickness is not None:
         fields["thickness"] = quadrature.element_mean(local_axes.thickness)
-        least, most = quadrature.minimum(local_axes.thickness), quadrature.maximum(
-            local_axes.thickness
-        )
-        words.append(f"wall {least:.4g} to {most:.4g} thick")
+        thinnest = quadrature.minimum(local_axes.thickness)
+        thickest = quadrature.maximum(local_axes.thickness)
+        words.append(f"wall {thinnest:.4g} to {thickest:.4g} thick")
     if local_axes.undefined is not None:
         undefined = local_axes.undefined.astype(np.float64)
         fields["undefined"] = undefined.max(axis=1)

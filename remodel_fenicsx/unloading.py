@@ -139,9 +139,9 @@ def found_unloaded(
         nonlocal runs, words
         runs += 1
         said(f"iteration {runs}{words}, {100 * share:g} % of the loads")
-        found = missed(numbers, share)
-        words = f", last error {np.abs(found).max():.0e}"
-        return found
+        difference = missed(numbers, share)
+        words = f", last error {np.abs(difference).max():.0e}"
+        return difference
 
     how: dict[str, Any] = {"alpha": scale, "line_search": None, "maxiter": MAX_FORWARD_RUNS}
     done, step = 0.0, 1.0
@@ -173,9 +173,9 @@ def found_unloaded(
 
 # ---------------------------------------------------------------- unloaded tubes
 # Radii and length.
-#  Forward runs have the scene's own kinematics, so that the following run reaches the dimensions of
+# Forward runs have the scene's own kinematics, so that the following run reaches the dimensions of
 # the scene. Broyden's method solves for the logarithms of the dimensions. It starts from inverse
-# elastostatics of one radius (`model.residual_stress.closing`), where loaded dimensions change
+# elastostatics of one radius (`model.residual_stress.close_ring`), where loaded dimensions change
 # about as the unloaded ones do.
 
 GEOMETRY_TOLERANCE = 1e-9  # relative tolerance of the loaded dimensions
@@ -202,13 +202,13 @@ def unloaded_tube(scene: Scene, comm: MPI.Intracomm, said: Said) -> Scene:
         GEOMETRY_TOLERANCE,
         said,
     )
-    found = np.exp(numbers)
+    dimensions = np.exp(numbers)
     unloaded, loaded = (
         f"radii {', '.join(f'{r:.6g}' for r in radii)}, length {l:.6g}"
-        for *radii, l in (found, given)
+        for *radii, l in (dimensions, given)
     )
     log.log(NOTICE, "unloaded: %s; under the loads: %s (%d runs)", unloaded, loaded, runs)
-    return _with_dimensions(scene, found)
+    return _with_dimensions(scene, dimensions)
 
 
 def _outer_radii(scene: Scene) -> dict[str, float]:
@@ -257,21 +257,19 @@ def _load_forward(scene: Scene, comm: MPI.Intracomm, numbers: Array, share: floa
         simulation.watchers = [simulation.observer]
         row = [step.row for step in simulation.steps()][-1]
         domain = simulation.domain
-        places, moves = (
-            domain.gather_nodes(domain.mesh.geometry.x),
-            simulation.state.gathered_displacement(),
-        )
+        nodes = domain.gather_nodes(domain.mesh.geometry.x)
+        moves = simulation.state.gathered_displacement()
     radii = None
-    if places is not None and moves is not None:
-        before, after = (np.hypot(x[:, 0], x[:, 1]) for x in (places, places + moves))
+    if nodes is not None and moves is not None:
+        before, after = (np.hypot(x[:, 0], x[:, 1]) for x in (nodes, nodes + moves))
         radii = np.array(
             [
                 after[np.abs(before - radius) < 1e-6 * numbers.max()].mean()
                 for radius in numbers[:-1]
             ]
         )
-    found: Array = comm.bcast(radii)
-    return np.append(found, numbers[-1] * (1 + row["axial_elongation"]))
+    loaded_radii: Array = comm.bcast(radii)
+    return np.append(loaded_radii, numbers[-1] * (1 + row["axial_elongation"]))
 
 
 def _with_dimensions(scene: Scene, numbers: Array) -> Scene:
@@ -293,9 +291,8 @@ def _with_dimensions(scene: Scene, numbers: Array) -> Scene:
 # step of that body.
 
 UNLOADED_MESH = "unloaded.msh"
-UPDATE_TOLERANCE = (
-    1e-10  # largest distance of a node from its measured position, over the body's extent
-)
+# Largest distance of a node from its measured position, over the body's extent.
+UPDATE_TOLERANCE = 1e-10
 
 
 def unloaded_mesh(scene: Scene, comm: MPI.Intracomm, folder: Path, said: Said) -> Scene:
@@ -306,9 +303,8 @@ def unloaded_mesh(scene: Scene, comm: MPI.Intracomm, folder: Path, said: Said) -
         None,
     )
     given: Array = comm.bcast(None if file is None else file.points)
-    extent, as_unloaded = float(np.ptp(given, axis=0).max()), scene.with_values(
-        {"geometry.is": "unloaded"}
-    )
+    extent = float(np.ptp(given, axis=0).max())
+    as_unloaded = scene.with_values({"geometry.is": "unloaded"})
 
     def missed(places: Array, share: float) -> Array:
         moved: Any = file and replace(file, points=places)
@@ -366,7 +362,8 @@ def _has_valid_elements(file: MeshFile) -> bool:
 
 def _missed(simulation: Simulation, given: Array, share: float) -> Array:
     """Return distances to loaded positions (nodes, 3), in file order on all ranks. Collective."""
-    domain, coupling, unknown = simulation.domain, simulation.stepper.coupling, simulation.unknown
+    domain, unknown = simulation.domain, simulation.unknown
+    coupling = simulation.stepper.coupling
     loads = simulation.load_values(simulation.scene.end_of_ramps)
     simulation.loading.set({name: share * value for name, value in loads.items()})
     dofs = dof_of_node(domain.mesh, unknown.function_space)
@@ -374,7 +371,7 @@ def _missed(simulation: Simulation, given: Array, share: float) -> Array:
     if not coupling.equilibrium.extension().admissible:
         raise ArithmeticError("no admissible state on the path: r >= L or J <= 0")
     change = coupling.newton.answer(coupling.equilibrium, 0)
-    found: Array = domain.comm.bcast(domain.gather_nodes(-change.reshape(-1, 3)[dofs]))
-    if not np.isfinite(found).all():
+    distances: Array = domain.comm.bcast(domain.gather_nodes(-change.reshape(-1, 3)[dofs]))
+    if not np.isfinite(distances).all():
         raise ArithmeticError("the tangent is singular")
-    return found
+    return distances

@@ -265,7 +265,7 @@ COLUMNS_ON_REQUEST: dict[str, Column] = {
             by_case=False,
         ),
         Column(
-            "asleep_share",
+            "inactive_fraction",
             "",
             "inactive fraction of the volume, below remodeling.threshold",
             lambda m: _remodeling(m).inactive_fraction(),
@@ -300,7 +300,7 @@ COLUMNS_ON_REQUEST: dict[str, Column] = {
             methodcaller("power"),
         ),
         Column(
-            "processor_seconds",
+            "cpu_seconds",
             "s",
             "CPU time of rank 0 in the step",
             lambda m: m.step.processor_seconds,
@@ -309,6 +309,13 @@ COLUMNS_ON_REQUEST: dict[str, Column] = {
         *_PROFILE_COLUMNS,
     )
 }
+for old_name, new_name in (
+    ("asleep_share", "inactive_fraction"),
+    ("processor_seconds", "cpu_seconds"),
+):
+    COLUMNS_ON_REQUEST[old_name] = replace(
+        COLUMNS_ON_REQUEST[new_name], name=old_name, meaning=f"earlier name of `{new_name}`"
+    )
 """Columns that a scene may name in `output.columns`; scripts may add columns."""
 
 

@@ -1,1 +1,1 @@
-"""Several runs of a scene that answer one question."""
+"""Studies: several runs of a scene that answer one question."""

@@ -1,4 +1,4 @@
-"""`remodel-fenicsx fit SCENE DATA.toml`: numbers of a scene from measurements, with what the data say of them."""
+"""Command `fit`: identification of parameters from measurements, with confidence intervals."""
 
 from __future__ import annotations
 
@@ -71,18 +71,18 @@ Array = NDArray[np.float64]
 Columns = dict[str, Array]
 
 
-# ---------------------------------------------------------------- what is read: data, checked before any solve
+# ---------------------------------------------------------------- data, checked before any solve
 LARGEST_TABLE = 10**7  # bytes: a hundred thousand rows
 DIMENSIONS = {"stress": STRESS, "length": LENGTH, "stress * length^2": FORCE, "force": FORCE}
-SCALE, SCALE_BOUNDS = "scale.", (
-    1e-3,
-    1e3,
-)  # what keys of factors on columns begin with, and their bounds
-WIDE = 1e3  # a bound that nobody gives over the start
-FROM_EDGE = 5e-4  # of a logarithm, from the end of a key's range: derivatives look `LOGARITHM_CHANGE` to both sides
+SCALE = "scale."  # prefix of the keys of factors on columns
+SCALE_BOUNDS = (1e-3, 1e3)  # bounds of factors on columns
+WIDE = 1e3  # default bound over the start
+# Distance of a logarithm from the end of a key's range, because derivatives need the values at
+# `LOGARITHM_CHANGE` on both sides.
+FROM_EDGE = 5e-4
 
 
-# ---------------------------------------------------------------- the file as it is written
+# ---------------------------------------------------------------- tables of DATA.toml
 Positive = Annotated[float, Field(gt=0)]
 _Number = Annotated[
     Positive | None, Field(json_schema_extra={"allowed": "a finite number greater than 0"})
@@ -90,7 +90,7 @@ _Number = Annotated[
 
 
 class Unknown(Table):
-    """An entry of [unknowns]: a number that is fitted, in logarithms."""
+    """An entry of [unknowns]: a positive parameter; its logarithm is fitted."""
 
     start: float = Field(gt=0)
     lower: _Number = None
@@ -113,12 +113,12 @@ class Unknown(Table):
 
     @property
     def bounds(self) -> tuple[float, float]:
-        """Those given, or a thousandth and a thousand times the start."""
+        """Lower and upper bound; by default a thousandth and a thousand times the start."""
         return self.lower or self.start / WIDE, self.upper or self.start * WIDE
 
 
 class MeasuredTable(Table):
-    """A table [[measured]]."""
+    """A table [[measured]] of DATA.toml."""
 
     file: str
     state: Literal["virgin", "history", "after"] = "virgin"
@@ -146,7 +146,7 @@ class MeasuredTable(Table):
 
 
 class DataFile(Table):
-    """DATA.toml."""
+    """The data file of a fit, DATA.toml."""
 
     unknowns: dict[str, Unknown] = Field(
         min_length=1,
@@ -159,7 +159,7 @@ class DataFile(Table):
     )
 
 
-# ---------------------------------------------------------------- the same beside a scene
+# ---------------------------------------------------------------- data with their scene
 @dataclass(frozen=True)
 class Measured:
     """A table of measurements in the scene's units."""
@@ -171,23 +171,22 @@ class Measured:
     loads: tuple[str, ...]
     sd: dict[str, float]
     scaled: tuple[str, ...]
-    units: dict[
-        str, tuple[str, float]
-    ]  # of the file where it has others, with their factors to the scene's
+    # The file's units that differ from the scene's, with their factors to the scene's units.
+    units: dict[str, tuple[str, float]]
 
     @property
     def rows(self) -> int:
-        """How many there are."""
+        """Number of rows of the table."""
         return len(next(iter(self.columns.values())))
 
     def over(self, name: str) -> str:
-        """The column over which a measured one is drawn: the load along its own axis, the first load, or time."""
+        """Return a measured column's abscissa: the load along its axis, the first load, or time."""
         same = [load for load in self.loads if load.rpartition("_")[2] == name.rpartition("_")[2]]
         return [*same, *self.loads, "time"][0]
 
     @property
     def protocols(self) -> list[NDArray[np.int64]]:
-        """Rows of each protocol in their order: between two of them the loads fall by more than half."""
+        """Rows of each protocol, in order; loads decrease by over half between two protocols."""
         sizes = [
             np.abs(self.columns[name]) / (np.abs(self.columns[name]).max() or 1.0)
             for name in self.loads
@@ -197,7 +196,7 @@ class Measured:
 
 
 def read_measurements(path: Path, scene: Scene) -> tuple[dict[str, Unknown], list[Measured]]:
-    """Unknowns by key, with bounds, and tables of DATA.toml, checked against a scene."""
+    """Read DATA.toml and check it with a scene; return unknowns by key, with bounds, and tables."""
     data = DataFile(**read_toml(path))
     measured = [
         _measured(table, f"measured[{number}]", path.parent, scene)
@@ -205,10 +204,8 @@ def read_measurements(path: Path, scene: Scene) -> tuple[dict[str, Unknown], lis
     ]
     starts = {key: unknown.start for key, unknown in data.unknowns.items()}
     for key, start in starts.items():
-        scene.with_values(
-            {key: start}
-        )  # a key that there is not, or that takes no such number, is refused
-    scene.with_values(starts)  # and what does not go together
+        scene.with_values({key: start})  # raises for unknown keys and invalid numbers
+    scene.with_values(starts)  # raises for invalid combinations
     unknowns = {
         key: _bounded(key, unknown, scene, starts) for key, unknown in data.unknowns.items()
     }
@@ -217,15 +214,16 @@ def read_measurements(path: Path, scene: Scene) -> tuple[dict[str, Unknown], lis
             start=1.0, lower=SCALE_BOUNDS[0], upper=SCALE_BOUNDS[1]
         )
     if len(unknowns) > sum(table.rows * len(table.sd) for table in measured):
-        raise SceneError(f"unknowns: {len(unknowns)} unknowns need as many measurements at least")
+        raise SceneError(f"unknowns: {len(unknowns)} unknowns need at least as many measurements")
     return unknowns, measured
 
 
 def _bounded(key: str, unknown: Unknown, scene: Scene, starts: Mapping[str, float]) -> Unknown:
-    """With bounds: its own, or the last numbers before them that are of the key's own range."""
+    """Return an unknown with its bounds, or the last numbers before them in the key's range."""
 
     def allowed(logarithm: float) -> bool:
-        """Whether it may be, with the others as they are or moved by the same factor: a wall keeps its form."""
+        # The start times a factor is allowed alone, or if all unknowns have the same factor, with
+        # which a wall keeps its shape.
         number = float(np.exp(logarithm))
         moved = {other: start * number / unknown.start for other, start in starts.items()}
         for values in ({**starts, key: number}, moved):
@@ -234,10 +232,10 @@ def _bounded(key: str, unknown: Unknown, scene: Scene, starts: Mapping[str, floa
         return False
 
     ends = []
-    for given, end in zip((unknown.lower, unknown.upper), unknown.bounds, strict=True):
+    for bound, end in zip((unknown.lower, unknown.upper), unknown.bounds, strict=True):
         inside, outside = np.log([unknown.start, end])
-        if given is not None and not allowed(outside):
-            scene.with_values({key: given})  # refuses what somebody has typed
+        if bound is not None and not allowed(outside):
+            scene.with_values({key: bound})  # raises for the bound in DATA.toml
         back = FROM_EDGE * np.sign(inside - outside)
         if not allowed(outside - back):
             while abs(outside - inside) > FROM_EDGE:
@@ -247,7 +245,8 @@ def _bounded(key: str, unknown: Unknown, scene: Scene, starts: Mapping[str, floa
         ends.append(end)
     if not ends[0] < ends[1]:
         raise SceneError(
-            f"unknowns.{key}: the scene takes no number beside {unknown.start:g}, so it is not fitted"
+            f"unknowns.{key}: the scene takes no other number than {unknown.start:g}, so it "
+            "cannot be fitted"
         )
     return unknown.model_copy(update=dict(zip(("lower", "upper"), ends, strict=True)))
 
@@ -265,7 +264,8 @@ def _measured(table: MeasuredTable, place: str, folder: Path, scene: Scene) -> M
         for name in getattr(table, key):
             if name not in columns or (name == "time" and key != "units"):
                 raise SceneError(
-                    f"{place}.{key}.{name}: no such column is measured; the file has {', '.join(columns)}"
+                    f"{place}.{key}.{name}: no such column is measured; the file has "
+                    f"{', '.join(columns)}"
                 )
     units = {
         name: (unit, _factor(name, unit, scene, f"{place}.units.{name} = {format_value(unit)}"))
@@ -295,13 +295,13 @@ def _measured(table: MeasuredTable, place: str, folder: Path, scene: Scene) -> M
 def _prescribed(
     columns: Columns, table: MeasuredTable, scene: Scene, place: str
 ) -> tuple[str, ...]:
-    """The loads among the columns: those that drive the test; of a force and a strain along one axis the strain."""
+    """Return the loads that drive the test; the strain if an axis has both force and strain."""
     kinds = scene.load_kinds
     for name in table.drive:
         if name not in columns or name not in kinds:
-            known = ", ".join(one for one in columns if one in kinds)
+            known = ", ".join(column for column in columns if column in kinds)
             raise SceneError(
-                f"{place}.drive = {format_value(name)}: allowed are the columns of loads: {known}"
+                f"{place}.drive = {format_value(name)}: must be columns of loads: {known}"
             )
     if table.drive:
         return table.drive
@@ -338,10 +338,8 @@ def _read_columns(path: Path, place: str, scene: Scene) -> Columns:
     for stretch, strain in strains.items():
         if stretch in columns and strain in columns:
             raise SceneError(f"{place}: has both {stretch} and {strain}")
-    for name in {*columns} & {
-        *strains,
-        *scene.load_kinds,
-    }:  # before any solve, which may fail because of them
+    # These warnings come before any solve, which may fail because of their cause.
+    for name in {*columns} & {*strains, *scene.load_kinds}:
         if words := convention_doubt(name, columns[name]):
             log.warning("%s, %s: %s", path.name, name, words)
     return {strains.get(name, name): values - (name in strains) for name, values in columns.items()}
@@ -375,7 +373,7 @@ WALL = ("wall_thickness", "inner_radius")
 def data_warnings(
     tables: Sequence[Measured], modelled: Sequence[Columns], scene: Scene
 ) -> Iterator[str]:
-    """Lines on measured columns that may be in another convention, beside the model at the start."""
+    """Yield warnings of measured columns that may have another convention than the model."""
     units = dimensions(scene)
     for table, model in zip(tables, modelled, strict=True):
         pairs = {f"{name} ({units[name]})": (table.columns[name], model[name]) for name in table.sd}
@@ -390,40 +388,37 @@ def data_warnings(
                 yield f"{table.name}, {name.partition(' (')[0]}: {words}"
 
 
-# ---------------------------------------------------------------- what a scene says where a table has measurements
-# keys whose numbers a simulation takes that is built already (`reset_simulation`)
-TISSUE, OTHERS = (
-    r"(regions\.\w+\.)?(material\.\w+|remodeling\.(kappa|half_life))",
-    r"loads\.\w+\.value|natural\.\w+",
-)
+# ---------------------------------------------------------------- model values at measurements
+# Keys whose numbers an existing simulation can take (`reset_simulation`).
+TISSUE = r"(regions\.\w+\.)?(material\.\w+|remodeling\.(kappa|half_life))"
+OTHERS = r"loads\.\w+\.value|natural\.\w+"
 CAN_BE_SET = rf"scale\..*|{TISSUE}|{OTHERS}"
-# what differences of runs divide by a small change is rounding alone
+# With these tolerances only rounding errors are amplified by difference quotients of runs.
 PRECISE = {"solver.relative_tolerance": 1e-13, "solver.absolute_tolerance": 0.0}
 
 
 def model_of(
     scene: Scene, table: Measured, scales: Mapping[str, float], kept: SimulationCache | None = None
 ) -> Columns:
-    """What a scene says where a table has measurements, by column, (rows,)."""
+    """Compute the model's values at the measurements of a table, (rows,), by column."""
     changes = PRECISE | {"output.columns": [*table.sd], "output.times": [], "output.fields": False}
     scene = resolve_auto_settings(scene.with_values(changes))
     if table.state == "history":
         measured, step = table.columns["time"], scene.time.step
         end = max(float(step * np.ceil(measured.max() / step - 1e-9)), step)
-        found, _ = _run(scene.with_values({"time.end": end}), table, kept)
-        return {name: np.interp(measured, found["time"], found[name]) for name in table.sd}
+        columns, _ = _run(scene.with_values({"time.end": end}), table, kept)
+        return {name: np.interp(measured, columns["time"], columns[name]) for name in table.sd}
     start = None
     if table.state == "after":
         _, start = _run(scene.with_values({"time.end": table.time}), table, kept)
-    found, _ = _run(_passive(scene, table, scales), table, kept, start)
-    return {name: found[name][found["time"] > 0] for name in table.sd}
+    columns, _ = _run(_passive(scene, table, scales), table, kept, start)
+    return {name: columns[name][columns["time"] > 0] for name in table.sd}
 
 
 def _passive(scene: Scene, table: Measured, scales: Mapping[str, float]) -> Scene:
-    """Cells that stay, and a step for each row; loads that the table has not keep their last value."""
-    replaced = {
-        scene.load_kinds[name].replaces for name in table.loads
-    }  # cannot be beside those of the table
+    """Return the scene of a test: a step for each row, fixed cells, further loads constant."""
+    # These loads exclude those of the table.
+    replaced = {scene.load_kinds[name].replaces for name in table.loads}
     loads = {}
     for name in [
         name for name in dict.fromkeys((*scene.loads, *table.loads)) if name not in replaced
@@ -445,17 +440,17 @@ def _passive(scene: Scene, table: Measured, scales: Mapping[str, float]) -> Scen
 
 
 class SimulationCache(dict[object, tuple[Simulation, Snapshot]]):
-    """Simulations on the way, which nobody hears: they stay, and get other numbers where a scene differs in no more."""
+    """Open simulations, without their warnings, for scenes that differ only in parameter values."""
 
     def __init__(self, keys: tuple[str, ...]):
         super().__init__()
         self.keys_of_scene = keys
 
     def __reduce__(self) -> tuple[object, ...]:
-        return SimulationCache, (self.keys_of_scene,)  # another process builds its own
+        return SimulationCache, (self.keys_of_scene,)  # each process builds its own simulations
 
     def simulation(self, scene: Scene, table: Measured, has_own_cells: bool) -> Simulation:
-        """At t = 0."""
+        """Return a simulation of the scene at t = 0, a cached one if possible."""
         use = id(table), has_own_cells, scene.model.kinematics, scene.mesh.formulation
         if use in self:
             if all(
@@ -463,13 +458,13 @@ class SimulationCache(dict[object, tuple[Simulation, Snapshot]]):
             ) and reset_simulation(*self[use], scene):
                 return self[use][0]
             self.pop(use)[0].close()
-        made = Simulation(scene, MPI.COMM_SELF)
-        made.watchers = [one for one in made.watchers if not isinstance(one, WarnsOnce)]
-        made.observer.columns = tuple(
-            one for one in made.observer.columns if one.name in ("time", *table.sd)
+        new = Simulation(scene, MPI.COMM_SELF)
+        new.watchers = [each for each in new.watchers if not isinstance(each, WarnsOnce)]
+        new.observer.columns = tuple(
+            column for column in new.observer.columns if column.name in ("time", *table.sd)
         )
-        self[use] = made, made.state.snapshot()
-        return made
+        self[use] = new, new.state.snapshot()
+        return new
 
 
 def _run(
@@ -478,7 +473,7 @@ def _run(
     kept: SimulationCache | None = None,
     start: tuple[Array, Array] | None = None,
 ) -> tuple[Columns, tuple[Array, Array]]:
-    """Columns and `time` of all steps; dimensions and axes of the cells at the end."""
+    """Return columns and `time` of all steps; dimensions and axes of the cells at the end."""
     simulation = (
         Simulation(scene, MPI.COMM_SELF)
         if kept is None
@@ -497,7 +492,7 @@ def _run(
     return {name: np.array([row[name] for row in rows]) for name in ("time", *table.sd)}, end
 
 
-# ---------------------------------------------------------------- what was evaluated, a line each in a file
+# ---------------------------------------------------------------- journal of evaluated points
 JOURNAL = "evaluations.jsonl"
 LARGEST_JOURNAL = 10**9  # bytes
 
@@ -505,10 +500,11 @@ Point = tuple[float, ...]
 
 
 def read_journal(folder: Path) -> tuple[str | None, dict[Point, Array]]:
-    """Which fit is in a folder, None where there is none, and the residuals of all points that were evaluated."""
-    path, mark, known = folder / JOURNAL, None, dict[Point, Array]()
+    """Read a folder's fit: its fingerprint, None if there is none, and residuals by point."""
+    path, mark = folder / JOURNAL, None
+    known = dict[Point, Array]()
     text = read_regular(path, LARGEST_JOURNAL).decode(errors="replace") if path.exists() else ""
-    with suppress(ValueError):  # the last line may have been cut off
+    with suppress(ValueError):  # The last line may be truncated.
         for line in map(json.loads, text.splitlines()):
             mark = mark or str(line.get("fit"))
             if "at" in line:
@@ -521,7 +517,7 @@ def _line(point: Point, residuals: Array) -> str:
 
 
 def fingerprint(problem: Problem) -> str:
-    """SHA-256 of all that a fit depends on but its starts."""
+    """Return the SHA-256 of everything that a fit depends on, except its starts."""
     parts = [__version__, PRECISE, problem.scene.to_toml(), problem.unknowns, problem.tables]
     text = json.dumps(
         parts, default=lambda part: part.tolist() if isinstance(part, np.ndarray) else vars(part)
@@ -530,50 +526,59 @@ def fingerprint(problem: Problem) -> str:
 
 
 # ---------------------------------------------------------------- least squares
-LOGARITHM_CHANGE = (
-    1e-4  # of a logarithm: central differences err by 1e-8, those to one side by 1e-4
-)
-SINGULAR_TOLERANCE = 1e-7  # smallest singular value over the largest, below which the data say nothing: what differences err by
-NAMED = 0.1  # share of a blind direction from which on an unknown is named
-FAILED_RUN_RESIDUAL = 1e3  # standard deviations, of all rows of a state that has no equilibrium
-START_SPREAD = np.log(2.0)  # of further starts, to both sides
+# Change of a logarithm: the error of central differences is 1e-8, of one-sided ones 1e-4.
+LOGARITHM_CHANGE = 1e-4
+# Smallest over largest singular value below which unknowns are not identifiable: the error of the
+# differences.
+SINGULAR_TOLERANCE = 1e-7
+NAMED = 0.1  # smallest component of an unknown that is named in an unidentifiable direction
+FAILED_RUN_RESIDUAL = 1e3  # standard deviations, for all rows of a state without equilibrium
+START_SPREAD = np.log(2.0)  # largest distance of further starts from the first, in logarithms
 SAME_MINIMUM = 1e-2  # relative difference of the sums of squares
-FIT_TOLERANCE = 1e-6  # relative change of the sum of squares, or of the unknowns, at which a fit ends: noise is far above it
-TELLING = 0.5  # of a change of the residuals: where a Jacobian misses more, the next is made by differences
-CORRELATED = 0.9  # of two unknowns, from which on their profiles are made
-PROFILE_STEPS = (-4, -2.5, -1.5, 0, 1.5, 2.5, 4)  # standard deviations of the straight line
-PROFILE_TOLERANCE = 1e-4  # as ENOUGH, of a profile's fits, which start where a straight line has their end, and before the last
-LIMITED_BY_MODEL = 1.5  # standard deviations that a model is off: the noise of ten rows alone is below 1.35 at 95 %
+# Relative change of the sum of squares, or of the unknowns, at which a fit ends. The noise is far
+# above it.
+FIT_TOLERANCE = 1e-6
+# Largest error of a predicted change of the residuals, over the change. If it is larger, the next
+# Jacobian is computed by differences.
+TELLING = 0.5
+CORRELATED = 0.9  # smallest correlation of two unknowns for which profiles are computed
+PROFILE_STEPS = (-4, -2.5, -1.5, 0, 1.5, 2.5, 4)  # standard deviations of the linear model
+# Like FIT_TOLERANCE, for the fits of a profile, which start at the end that the linear model
+# predicts, and for all fits before the last.
+PROFILE_TOLERANCE = 1e-4
+# RMS of the normalised residuals. By the noise of ten rows alone it is below 1.35 at 95 %.
+LIMITED_BY_MODEL = 1.5
 NORMAL_95 = 1.959963984540054  # standard deviations on each side, normal distribution
 
 
 class Problem:
-    """Residuals over their standard deviations as a function of the logarithms of the unknowns."""
+    """Normalised residuals as a function of the logarithms of the unknowns."""
 
     def __init__(self, scene: Scene, unknowns: Mapping[str, Unknown], tables: Sequence[Measured]):
-        self.scene, self.unknowns, self.tables = scene, dict(unknowns), list(tables)
+        self.scene, self.unknowns = scene, dict(unknowns)
+        self.tables = list(tables)
         self.bounds = np.log([unknown.bounds for unknown in unknowns.values()])
         self.known: dict[Point, Array] = {}
         self.journal: Path | None = None
         self.kept = SimulationCache(tuple(unknowns))
 
     def begin(self, folder: Path, mark: str) -> None:
-        """Keep what is evaluated in the folder, from now on and before; a line that was cut off goes."""
+        """Start the journal in the folder with all evaluated points, without a truncated line."""
         self.journal = folder / JOURNAL
         check_no_link(self.journal)
         head = json.dumps({"fit": mark}) + "\n"
         self.journal.write_text(
-            head + "".join(_line(*one) for one in self.known.items()), encoding="utf-8"
+            head + "".join(_line(*item) for item in self.known.items()), encoding="utf-8"
         )
 
     def scene_of(self, logarithms: Array) -> Scene:
-        """The scene with these numbers."""
+        """Return the scene with these parameters."""
         return self.scene.with_values(
             {key: n for key, n in self._numbers(logarithms) if not key.startswith(SCALE)}
         )
 
     def scales_of(self, logarithms: Array) -> dict[str, float]:
-        """Factors on columns, by name."""
+        """Return the factors on columns, by name."""
         return {
             key.removeprefix(SCALE): n
             for key, n in self._numbers(logarithms)
@@ -584,12 +589,12 @@ class Problem:
         return zip(self.unknowns, map(float, np.exp(logarithms)), strict=True)
 
     def predictions(self, logarithms: Array, kept: SimulationCache | None = None) -> list[Columns]:
-        """What the model says of each table."""
+        """Compute the model's values at the measurements of each table."""
         scene, scales = self.scene_of(logarithms), self.scales_of(logarithms)
         return [model_of(scene, table, scales, kept) for table in self.tables]
 
     def residuals(self, logarithms: Array) -> Array:
-        """Model less measurement over standard deviation, table by table; then the priors."""
+        """Return (model - measurement) / standard deviation, table by table; then the priors."""
         key = tuple(map(float, logarithms))
         if key not in self.known:
             with muted_warnings():
@@ -601,29 +606,30 @@ class Problem:
 
     def _evaluated(self, x: Array) -> Array:
         scales, models = self.scales_of(x), list[Columns]()
-        with suppress(
-            StepFailure, SceneError
-        ):  # numbers that do not go together have no equilibrium either
+        # Invalid combinations of numbers have no equilibrium either.
+        with suppress(StepFailure, SceneError):
             models = self.predictions(x, self.kept)
         parts: list[ArrayLike] = []
         for table, model in zip_longest(self.tables, models):
             for name, sd in table.sd.items():
-                off = (
+                difference = (
                     model[name] - scales.get(name, 1.0) * table.columns[name]
                     if model
                     else FAILED_RUN_RESIDUAL * sd
                 )
-                parts.append(np.full(table.rows, off / sd))
+                parts.append(np.full(table.rows, difference / sd))
         for unknown, value in zip(self.unknowns.values(), x, strict=True):
             if unknown.prior is not None:
                 parts.append([(value - np.log(unknown.prior)) / unknown.prior_sd])
         return np.concatenate(parts)
 
     def jacobian(self, logarithms: Array, central: bool = False) -> Array:
-        """Derivatives, (residuals, unknowns), by differences of runs."""
+        """Compute the derivatives, (residuals, unknowns), by differences of runs."""
         columns = []
-        for k, way in enumerate(LOGARITHM_CHANGE * np.eye(len(logarithms))):
-            ahead, behind = (np.clip(logarithms + side * way, *self.bounds.T) for side in (1, -1))
+        for k, change in enumerate(LOGARITHM_CHANGE * np.eye(len(logarithms))):
+            ahead, behind = (
+                np.clip(logarithms + side * change, *self.bounds.T) for side in (1, -1)
+            )
             if not central:
                 behind, ahead = (
                     (logarithms, ahead) if ahead[k] > logarithms[k] else (behind, logarithms)
@@ -634,33 +640,36 @@ class Problem:
         return np.transpose(columns)
 
     def check_identifiable(self, jacobian: Array) -> None:
-        """Refuse unknowns of which the data say nothing."""
+        """Raise if the data do not determine some unknowns."""
         _, singular, directions = np.linalg.svd(jacobian, full_matrices=False)
         if singular[-1] > SINGULAR_TOLERANCE * singular[0]:
             return
         blind = directions[-1] * np.sign(directions[-1][np.abs(directions[-1]).argmax()])
-        pairs = [
-            (key, part) for key, part in zip(self.unknowns, blind, strict=True) if abs(part) > NAMED
-        ]
-        named = [f"{key} ({part:+.2f})" for key, part in pairs]
-        if len(named) == 1:
+        powers = {
+            key: power
+            for key, power in zip(self.unknowns, blind, strict=True)
+            if abs(power) > NAMED
+        }
+        names = ", ".join(powers)
+        if len(powers) == 1:
             raise SceneError(
-                f"unknowns: {pairs[0][0]} changes nothing that is measured; fix it or give it a prior"
+                f"unknowns: {names} changes nothing that is measured; fix it or set a prior"
             )
+        scaled = " and ".join(f"{key} by s^{power:+.2f}" for key, power in powers.items())
         raise SceneError(
-            f"unknowns: the data cannot tell apart {', '.join(named)}: changed together by these powers of a factor "
-            f"they give the same measurements; fix one of them or give it a prior"
+            f"unknowns: {names} are not identifiable: scaling {scaled} leaves the measurements "
+            "unchanged; fix one of them or set a prior"
         )
 
 
 class InfeasibleStart(RemodelError):  # noqa: N818
-    """A fit starts where the scene has no equilibrium."""
+    """The scene has no equilibrium at the start of a fit."""
 
     exit_code = SOLVE_FAILED
 
 
 class LostProcess(RemodelError):  # noqa: N818
-    """A process of a fit has ended too early, as where somebody kills it."""
+    """A process of a fit has ended early, for example because it was killed."""
 
     exit_code = BAD_ENVIRONMENT
 
@@ -670,33 +679,33 @@ Task = Callable[[Problem], "OptimizeResult"]
 
 @dataclass(frozen=True)
 class Part(Run):
-    """A part of a fit, for a worker: what a task makes of the problem is left in its file."""
+    """A part of a fit for a worker, which leaves the result of a task in a file."""
 
     work: tuple[Problem, Task]
 
     def is_complete(self) -> bool:
-        """It is not recorded: what was evaluated for it is known."""
+        """Return False: a part is not recorded, but its evaluated points are known."""
         return False
 
     def begin(self, worker: Worker) -> None:
-        """Begin it."""
+        """Start the part in a worker."""
         file = self.sibling_path(".pickle")
         file.write_bytes(pickle.dumps(self.work))
         worker.begin([PART, str(file)], self.sibling_path(".txt"))
 
     @property
     def answer(self) -> OptimizeResult:
-        """What its process has left."""
+        """Result of the task, from the part's file."""
         return pickle.loads(self.sibling_path(".pickle").read_bytes())
 
 
 class _FitStudy(Study):
-    """Parts of a fit, side by side."""
+    """Study whose runs are the parts of a fit."""
 
     def answers(
         self, problem: Problem, place: Path, tasks: Mapping[str, Task]
     ) -> list[OptimizeResult]:
-        """What the tasks make of the problem, which then knows what was evaluated for them."""
+        """Return the results of the tasks; the problem gets the points evaluated for them."""
         parts = [
             Part(name, self.scene, self.folder / name, (problem, task))
             for name, task in tasks.items()
@@ -707,16 +716,16 @@ class _FitStudy(Study):
         return [part.answer for part in parts]
 
     def update(self) -> None:
-        """End it with the first part that fails."""
+        """Raise if a part has failed."""
         for name, words in self.failed.items():
             raise LostProcess(
-                f"{name}: {words}; where memory is short, --jobs 1 takes less; all that is recorded is kept, the same "
-                "command goes on"
+                f"{name}: {words}; if memory is short, --jobs 1 takes less; all recorded results "
+                "are kept; repeat the command to resume"
             )
 
 
 def do_part(file: Path) -> None:
-    """Do a part of a fit, in a process of a study: the task in the file gives way to its answer."""
+    """Do a part of a fit in a worker process; replace the task in the file by its result."""
     problem, task = pickle.loads(file.read_bytes())
     write_whole(file, pickle.dumps(task(problem)))
 
@@ -730,7 +739,7 @@ def fit(
     profiles: bool = True,
     jobs: int | None = None,
 ) -> tuple[Path, Fit]:
-    """Fit numbers of a scene to measurements."""
+    """Fit parameters of a scene to measurements."""
     if scene.cases:
         raise SceneError("cases: a fit takes one load case; leave out [[cases]]")
     with buffer_log(quiet=quiet) as held:
@@ -757,14 +766,14 @@ def fit(
         rough = partial(minimised, near=(first, jacobian), enough=PROFILE_TOLERANCE)
         with closing(_FitStudy("fit", scene, parts, {}, jobs, quiet)) as study:
             on_cores = partial(study.answers, problem, place)
-            found = on_cores(
+            minima = on_cores(
                 {f"start {n}": partial(rough, start=x) for n, x in enumerate(points, start=1)}
             )
-            best = int(np.argmin([one.cost for one in found]))
-            again = partial(minimised, start=found[best].x)
-            (found[best],) = on_cores({f"from the end of start {best + 1}": again})
-            log.info("sums of squares: %s", ", ".join(f"{2 * one.cost:.6g}" for one in found))
-            result = result_of(problem, found)
+            best = int(np.argmin([end.cost for end in minima]))
+            again = partial(minimised, start=minima[best].x)
+            (minima[best],) = on_cores({f"from the end of start {best + 1}": again})
+            log.info("sums of squares: %s", ", ".join(f"{2 * end.cost:.6g}" for end in minima))
+            result = result_of(problem, minima)
             if profiles:
                 result = with_profiles(problem, result, on_cores)
         log.info("%s", result.verdict())
@@ -776,7 +785,7 @@ def fit(
 
 
 def _begun(problem: Problem) -> tuple[Array, Array]:
-    """The start, doubts of which are logged, and the derivatives there, which must tell the unknowns apart."""
+    """Return the start and the derivatives there; log warnings, check that all is identifiable."""
     first = np.log([unknown.start for unknown in problem.unknowns.values()])
     for words in problem.scene_of(first).warnings():
         log.warning("%s", words)
@@ -794,7 +803,7 @@ def _begun(problem: Problem) -> tuple[Array, Array]:
 
 
 def _place(folder: Path | str | None, name: str, mark: str) -> tuple[Path, dict[Point, Array]]:
-    """The folder of the same fit with what it knows, or a new one."""
+    """Return the folder of the same fit with its evaluated points, or a new folder."""
     wanted = Path(folder or Path("results") / name)
     present, known = read_journal(wanted)
     if present == mark:
@@ -813,18 +822,18 @@ def minimised(
     near: tuple[Array, Array] | None = None,
     enough: float = FIT_TOLERANCE,
 ) -> OptimizeResult:
-    """SciPy's least squares from a start, logarithms."""
-    # The Jacobian, by differences or that of a point `near`, is updated (Broyden 1965) as long as it tells what
-    # residuals do: differences are made only where they pay
+    """Minimise the sum of squares from a start, in logarithms, by SciPy's least squares."""
+    # The Jacobian, by differences or that of a point `near`, is updated (Broyden 1965) as long as
+    # it predicts the residuals, because differences are expensive.
     from scipy.optimize import least_squares
 
     free = np.array([number != held for number in range(len(start))])
     bounds = problem.bounds[free].T
 
     def whole(x: Array) -> Array:
-        found = start.copy()
-        found[free] = x
-        return found
+        point = start.copy()
+        point[free] = x
+        return point
 
     def jacobian(x: Array) -> Array:
         nonlocal near
@@ -849,101 +858,105 @@ def minimised(
     )
 
 
-def result_of(problem: Problem, found: Sequence[OptimizeResult]) -> Fit:
-    """The best of several minima, with bands."""
-    logarithms: Array = min(found, key=lambda one: float(one.cost)).x
+def result_of(problem: Problem, ends: Sequence[OptimizeResult]) -> Fit:
+    """Return the best of several minima, with its covariance."""
+    logarithms: Array = min(ends, key=lambda end: float(end.cost)).x
     jacobian = problem.jacobian(logarithms, central=True)
     problem.check_identifiable(jacobian)
     misfit = float(np.sqrt(np.mean(problem.residuals(logarithms) ** 2)))
-    covariance, minima = np.asarray(np.linalg.inv(jacobian.T @ jacobian)), [
-        2 * float(one.cost) for one in found
-    ]
+    covariance = np.asarray(np.linalg.inv(jacobian.T @ jacobian))
+    minima = [2 * float(end.cost) for end in ends]
     scene, models = problem.scene_of(logarithms), problem.predictions(logarithms)
     return Fit(scene, problem, logarithms, covariance, misfit, minima, models)
 
 
 def with_profiles(
-    problem: Problem, found: Fit, on_cores: Callable[[Mapping[str, Task]], list[OptimizeResult]]
+    problem: Problem, result: Fit, on_cores: Callable[[Mapping[str, Task]], list[OptimizeResult]]
 ) -> Fit:
-    """The fit with profiles of what goes together: the others are fitted again at each value."""
-    best, ends = found.logarithms, problem.bounds.T
-    least, near = float(np.sum(problem.residuals(best) ** 2)), (
-        best,
-        problem.jacobian(best, central=True),
-    )
-    chosen = np.flatnonzero((np.abs(found.correlations) > CORRELATED).sum(axis=0) > 1)
-    ways = found.inflation * found.covariance[chosen] / found.deviations[chosen, None]
-    points = np.clip(
-        best + np.multiply.outer(PROFILE_STEPS, ways), *ends
-    )  # (steps, chosen, unknowns)
+    """Return the fit with likelihood profiles of correlated unknowns.
+
+    At each value of such an unknown all other unknowns are fitted again.
+    """
+    best, ends = result.logarithms, problem.bounds.T
+    least = float(np.sum(problem.residuals(best) ** 2))
+    near = best, problem.jacobian(best, central=True)
+    chosen = np.flatnonzero((np.abs(result.correlations) > CORRELATED).sum(axis=0) > 1)
+    directions = result.inflation * result.covariance[chosen] / result.deviations[chosen, None]
+    # (steps, chosen, unknowns)
+    points = np.clip(best + np.multiply.outer(PROFILE_STEPS, directions), *ends)
     tasks = {
-        f"profile of {found.keys[held]} at {steps:+g}": partial(
+        f"profile of {result.keys[held]} at {steps:+g}": partial(
             minimised, start=x, held=int(held), near=near, enough=PROFILE_TOLERANCE
         )
         for steps, row in zip(PROFILE_STEPS, points, strict=True)
         for held, x in zip(chosen, row, strict=True)
     }
-    costs = np.reshape([one.cost for one in on_cores(tasks)], points.shape[:2])
+    costs = np.reshape([end.cost for end in on_cores(tasks)], points.shape[:2])
     profiles = {}
     for held, values, cost in zip(
         chosen, points.T[chosen, range(len(chosen))], costs.T, strict=True
     ):
-        # the root of the increase is nearly a straight line; where it is that of the band; NaN beyond all points
+        # The root of the increase is nearly linear. The interval ends where it is NORMAL_95; NaN if
+        # that is beyond all points.
         roots = (
-            np.sign(PROFILE_STEPS) * np.sqrt(np.maximum(2 * cost - least, 0.0)) / found.inflation
+            np.sign(PROFILE_STEPS) * np.sqrt(np.maximum(2 * cost - least, 0.0)) / result.inflation
         )
         beyond = [value if value in ends[:, held] else np.nan for value in values[[0, -1]]]
-        profiles[found.keys[held]] = np.exp(
+        profiles[result.keys[held]] = np.exp(
             np.interp([-NORMAL_95, NORMAL_95], roots, values, *beyond)
         )
-    return replace(found, profiles=profiles)
+    return replace(result, profiles=profiles)
 
 
-# ---------------------------------------------------------------- the answer
+# ---------------------------------------------------------------- result
 @dataclass(frozen=True)
 class Fit(StudyResult):
-    """What a fit has found."""
+    """Result of a fit: the minimum, its covariance and likelihood profiles."""
 
     scene: Scene
     problem: Problem
     logarithms: Array
     covariance: Array  # of the logarithms, by the noise alone
-    misfit: float
+    misfit: float  # RMS of the normalised residuals
     minima: list[float]
     modelled: list[Columns]
-    profiles: Columns = field(default_factory=dict)  # bands by likelihood profiles, their two ends
+    profiles: Columns = field(default_factory=dict)  # 95 % confidence limits, (2,), by profiles
 
-    name, about, only_in_file = "fit", "measured and fitted", ("limited_by",)
-    caption = "Points: measured, with one standard deviation; lines: the fitted model. Each protocol has its panels."
+    name, about = "fit", "measured and fitted"
+    only_in_file = ("limited_by",)
+    caption = (
+        "Points: measured, with one standard deviation; lines: the fitted model. "
+        "Each protocol has its panels."
+    )
 
     @property
     def keys(self) -> list[str]:
-        """Of the unknowns."""
+        """Keys of the unknowns, in order."""
         return list(self.problem.unknowns)
 
     @property
     def values(self) -> Array:
-        """Of the unknowns."""
+        """Fitted values of the unknowns, (n,)."""
         return np.exp(self.logarithms)
 
     @property
     def deviations(self) -> Array:
-        """Standard deviations of the logarithms, by the noise alone."""
+        """Standard deviations of the logarithms by the noise alone, (n,)."""
         return np.sqrt(np.diag(self.covariance))
 
     @property
     def correlations(self) -> Array:
-        """Of the logarithms."""
+        """Correlation matrix of the logarithms, (n, n)."""
         return np.asarray(self.covariance / np.outer(self.deviations, self.deviations))
 
     @property
     def inflation(self) -> float:
-        """What widens the bands: the misfit, where it says that the model and not the noise limits them."""
+        """Factor on the confidence intervals: the misfit if the model limits them, else 1."""
         return self.misfit if self.misfit > LIMITED_BY_MODEL else 1.0
 
     @cached_property
     def band(self) -> Array:
-        """Ends of the logarithms, (2, n), not beyond the bounds."""
+        """95 % confidence limits of the logarithms, (2, n), within the bounds."""
         half = NORMAL_95 * self.inflation * self.deviations
         return np.clip(
             [self.logarithms - half, self.logarithms + half], *self.problem.bounds.T[:, None]
@@ -951,7 +964,7 @@ class Fit(StudyResult):
 
     @property
     def open(self) -> list[str]:
-        """Which ends of each band are bounds: nothing, lower, upper or both."""
+        """Ends of each confidence interval that are bounds: nothing, lower, upper or both."""
         return [
             ("", "lower", "upper", "both")[low + 2 * high]
             for low, high in self.band.T == self.problem.bounds
@@ -959,11 +972,11 @@ class Fit(StudyResult):
 
     @property
     def limited_by(self) -> str:
-        """What limits the bands."""
+        """Cause that limits the accuracy: "noise" or "model"."""
         return "noise" if self.inflation == 1.0 else "model"
 
     def table(self) -> dict[str, ArrayLike]:
-        """A row for each unknown."""
+        """Return the columns of fit.csv, with a row for each unknown."""
         lower, upper = np.exp(self.band)
         profiles = np.transpose([self.profiles.get(key, [np.nan, np.nan]) for key in self.keys])
         return {
@@ -979,30 +992,29 @@ class Fit(StudyResult):
         }
 
     def verdict(self) -> str:
-        """How far the model is off, how many starts agree, and which unknowns go together."""
+        """Return RMS of the normalised residuals, agreement of starts, and correlated unknowns."""
         least, keys = min(self.minima), self.keys
-        same = sum(one - least <= SAME_MINIMUM * max(least, 1.0) for one in self.minima)
-        text = f"The model is off by {self.misfit:.2g} standard deviations (root mean square); "
+        same = sum(end - least <= SAME_MINIMUM * max(least, 1.0) for end in self.minima)
+        text = f"RMS of the normalised residuals: {self.misfit:.2g}; "
         text += f"{same} of {len(self.minima)} starts end in this minimum."
         if self.limited_by == "model":
-            text += (
-                f" Bands are {self.misfit:.2g} times those of the noise, for the model limits them."
-            )
+            text += f" The model limits the accuracy: confidence intervals are {self.misfit:.2g} "
+            text += "times those of the noise."
         pairs = np.argwhere(np.triu(np.abs(self.correlations) > CORRELATED, 1))
         together = [f"{keys[i]} and {keys[j]} ({self.correlations[i, j]:+.2f})" for i, j in pairs]
         if together:
-            text += f" Correlated above {CORRELATED:g}, so that profiles count, not bands: {', '.join(together)}."
+            text += f" Correlated above {CORRELATED:g}, so use the profiles: {', '.join(together)}."
         return text
 
     def write(self, folder: Path) -> None:
-        """Write tables and picture."""
+        """Write the tables and the picture into a folder."""
         super().write(folder)
         correlations = dict(zip(self.keys, self.correlations, strict=True))
         notes = [self.title, made_with()]
         Page(folder, "correlations").save_table({"key": self.keys, **correlations}, notes)
 
     def figure(self) -> Figure:
-        """A panel for each measured column of each protocol, over what was prescribed along its axis."""
+        """Plot each measured column of each protocol over its prescribed load, or time."""
         shown = [
             (table, model[name], name, rows, f", protocol {number} of {len(table.protocols)}")
             for table, model in zip(self.problem.tables, self.modelled, strict=True)
@@ -1013,9 +1025,11 @@ class Fit(StudyResult):
         for axes, (table, model, name, rows, which) in zip(grid, shown, strict=True):
             over = table.over(name)
             (unit_of_x, per_x), (unit, per) = (
-                table.units.get(one, ("", 1.0)) for one in (over, name)
+                table.units.get(column, ("", 1.0)) for column in (over, name)
             )
-            x, y = (scales.get(one, 1.0) * table.columns[one][rows] for one in (over, name))
+            x, y = (
+                scales.get(column, 1.0) * table.columns[column][rows] for column in (over, name)
+            )
             axes.errorbar(
                 x / per_x,
                 y / per,
@@ -1025,10 +1039,8 @@ class Fit(StudyResult):
                 label="measured",
             )
             axes.plot(x / per_x, model[rows] / per, color=COLOURS[1], label="fitted model")
-            axes.set_title(
-                f"{Path(table.name).name} ({table.state}){which if len(table.protocols) > 1 else ''}",
-                fontsize=8,
-            )
+            title = f"{Path(table.name).name} ({table.state})"
+            axes.set_title(title + which if len(table.protocols) > 1 else title, fontsize=8)
             axes.set(
                 xlabel=label(self.scene, over, unit_of_x), ylabel=label(self.scene, name, unit)
             )

@@ -1,4 +1,4 @@
-"""`remodel-fenicsx stability SCENE`: the factor by which a pass of a run multiplies a small change of the cells."""
+"""Command `stability`: amplification factors of small changes of the cells by remodeling passes."""
 
 from __future__ import annotations
 
@@ -27,27 +27,30 @@ from remodel_fenicsx.studies.study import COLOURS, StudyResult
 log = logging.getLogger(__name__)
 
 
-GROWS = 1.001  # factor: changes that no pass touches, where tension is missing, keep their size to what was iterated
-SIZE = 1e-5  # of a change of A, over tr A
-PASSES = 40  # at most, each a solve
-SETTLED = 1e-4  # relative difference of the factors of two passes
-AVERAGED = 10  # last factors whose mean is taken if they have not settled, as where a change turns
+# Smallest factor of growth. Without tension no pass affects a change, and its factor is 1 up to the
+# error of the iteration.
+GROWS = 1.001
+SIZE = 1e-5  # size of a change of A, over tr A
+PASSES = 40  # largest number of passes, each a solve
+SETTLED = 1e-4  # relative difference of the factors of two passes at convergence
+AVERAGED = 10  # number of last factors to average without convergence, as for rotating changes
 
 
 def pass_factor(stepper: Stepper, step: Step) -> float:
-    """Return by what passes at the solved state multiply a small change of A, below zero if it swings.
+    """Return the factor of passes on a small change of A at the solved state; < 0 if A oscillates.
 
-    Each pass takes the change that the one before has left, made small again (power iteration).
+    This is a power iteration: each pass starts from the change that the previous one has left,
+    scaled to be small.
     """
-    state, remodeling, coupling = stepper.state, stepper.remodeling, stepper.coupling
+    state, remodeling = stepper.state, stepper.remodeling
     quadrature, cells = state.cells.quadrature, state.cells.point_cells.copy()
-    tensor, newton = structure_tensor(*cells[:2]), getattr(
-        coupling, "newton"
-    )  # noqa: B009 - couplings of others
+    tensor = structure_tensor(*cells[:2])
+    newton = getattr(stepper.coupling, "newton")  # noqa: B009 - user-supplied couplings
 
     def passed() -> Array:
-        asked, _ = remodeling.updated_cells(state.time, step.time, step.work.residual)
-        return structure_tensor(*relaxed(state.cells.point_cells, asked, remodeling.relaxation)[:2])
+        target, _ = remodeling.updated_cells(state.time, step.time, step.work.residual)
+        relaxed_cells = relaxed(state.cells.point_cells, target, remodeling.relaxation)
+        return structure_tensor(*relaxed_cells[:2])
 
     def dot(one: Array, other: Array) -> float:
         return float(quadrature.integral(np.sum(one * other, axis=(1, 2))))
@@ -78,26 +81,24 @@ def pass_factor(stepper: Stepper, step: Step) -> float:
 
 
 class FactorWatcher(Watcher):
-    """Computes the factor of the pass of chosen steps, by their times."""
+    """Watcher that computes the factor of the pass at selected steps, by their times."""
 
     def __init__(self, stepper: Stepper, chosen: Callable[[Step], bool]):
         self.stepper, self.chosen = stepper, chosen
         self.factors: dict[float, float] = {}
 
     def solved(self, step: Step) -> None:
-        """Compute it."""
+        """Compute the factor at the solved state of a selected step."""
         if not self.chosen(step):
             return
         try:
             self.factors[step.time] = pass_factor(self.stepper, step)
         except SolveFailure as failure:
-            log.warning(
-                "time %g: the factor of the pass is not known: %s", step.time, failure.reason
-            )
+            log.warning("time %g: the factor of the pass is unknown: %s", step.time, failure.reason)
             self.factors[step.time] = np.nan
 
     def undone(self, step: Step) -> None:
-        """Forget it."""
+        """Remove the factor of a step that is undone."""
         self.factors.pop(step.time, None)
 
 
@@ -108,16 +109,18 @@ def stability(
     comm: MPI.Intracomm = MPI.COMM_WORLD,
     quiet: bool = True,
 ) -> tuple[Path, Analysis]:
-    """Run a scene and compute the factor of its passes at some times."""
+    """Run a scene and compute the factor of its passes at `number` times."""
     if not LAWS[scene.remodeling.law].remodels:
         raise SceneError(
-            f"remodeling.law = {scene.remodeling.law!r}: nothing remodels, so there is no pass to analyse"
+            f"remodeling.law = {scene.remodeling.law!r}: nothing remodels, so there is no pass to "
+            "analyse"
         )
     if scene.cases[1:]:
         raise SceneError("cases: the analysis takes one load case; leave out [[cases]]")
     if scene.time.is_adaptive:
         raise SceneError(
-            f"time.tolerance = {scene.time.tolerance:g}: the analysis needs equal steps; leave it out"
+            f"time.tolerance = {scene.time.tolerance:g}: the analysis needs equal steps; "
+            "leave it out"
         )
     place = chosen_folder(folder, f"{scene.name}-stability", comm)
     steps, made = scene.time.number_of_steps, list[FactorWatcher]()
@@ -143,15 +146,15 @@ def stability(
             watchers=[watcher],
         )
     finally:
-        if comm.rank == 0 and made and made[0].factors:  # of a run that ends early too
+        if comm.rank == 0 and made and made[0].factors:  # also of a run that ends early
             answer().write(place)
     return place, answer()
 
 
-# ---------------------------------------------------------------- the answer
+# ---------------------------------------------------------------- result
 @dataclass(frozen=True)
 class Analysis(StudyResult):
-    """Factors of the passes, of which the coupling makes a share, by time; NaN where none was found."""
+    """Factors of the passes by time, NaN if unknown, with the coupling's relaxation factor."""
 
     scene: Scene
     factors: dict[float, float]
@@ -159,42 +162,51 @@ class Analysis(StudyResult):
     share: float
 
     name = "stability"
-    caption = "Factor by which one pass multiplies a small change of the cells; beyond -1 and 1 the change grows."
+    caption = (
+        "Factor by which one pass multiplies a small change of the cells; "
+        "beyond -1 and 1 the change grows."
+    )
 
     @property
     def about(self) -> str:  # type: ignore[override]
-        """What is shown."""
+        """Second half of the title: driver, frame and coupling."""
         how = self.scene.remodeling
         return f"driver {how.driver}, frame {how.frame}, coupling {how.coupling}"
 
     def table(self) -> dict[str, list[float]]:
-        """A row for each time."""
+        """Return the columns of stability.csv, with a row for each time."""
         return {"time": [*self.factors], "factor": [*self.factors.values()]}
 
     def verdict(self) -> str:
-        """Whether passes make small changes smaller; and what a reduction does not see."""
-        number, times, factors = len(self.factors), *map(np.array, self.table().values())
+        """Return whether passes damp small changes, and what a reduction cannot show."""
+        number = len(self.factors)
+        times, factors = map(np.array, self.table().values())
         grows = np.abs(factors) > GROWS
-        text = f"Stable: at all {number} times a pass makes small changes of the cells smaller, or keeps them."
+        at_all = "a pass makes small changes of the cells smaller, or keeps them."
+        text = f"Stable: at all {number} times {at_all}"
         if grows.any():
             worst = int(np.nanargmax(np.abs(factors)))
             text = (
-                f"Unstable: at {grows.sum()} of {number} times a pass makes small changes of the cells larger, first "
-                f"at {times[grows][0]:g}; the worst by a factor of {factors[worst]:.5g}, at time {times[worst]:g}."
+                f"Unstable: at {grows.sum()} of {number} times a pass makes small changes of the "
+                f"cells larger, first at {times[grows][0]:g}; the worst by a factor of "
+                f"{factors[worst]:.5g}, at time {times[worst]:g}."
             )
-            if (
-                lowest := np.nanmin(factors)
-            ) < -GROWS:  # of a smaller share it is 1 - (1 - factor) smaller / share
+            # With a relaxation factor theta in place of theta_0 the factor g becomes
+            # 1 - (1 - g) theta / theta_0.
+            if (lowest := np.nanmin(factors)) < -GROWS:
                 damping = 2 * self.share / (1 - lowest)
-                text += f" The coupling 'relaxed' with a relaxation_factor below {damping:.2g} damps what swings."
+                text += " The coupling 'relaxed' with a relaxation_factor below "
+                text += f"{damping:.2g} damps the oscillation."
         elif missing := np.isnan(factors).sum():
-            text = f"Not known: at {missing} of {number} times no factor was found; stable at all others."
+            text = f"Unknown: at {missing} of {number} times the factor could not be computed; "
+            text += "stable at all other times."
         if KINEMATICS[self.kinematics].reduced:
-            text += f" But kinematics {self.kinematics!r} sees changes that keep its symmetry only; 'full' sees all."
+            text += f" But kinematics {self.kinematics!r} shows only changes with its symmetry; "
+            text += "'full' shows all."
         return text
 
     def figure(self) -> Figure:
-        """Factors over time."""
+        """Plot the factors over time."""
         figure = Figure(figsize=(5.2, 3.4), layout="constrained")
         axes = figure.add_subplot()
         axes.axhspan(-1, 1, color=COLOURS[2], alpha=0.12, linewidth=0, label="stable: from −1 to 1")

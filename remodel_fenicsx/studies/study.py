@@ -1,6 +1,7 @@
-"""A study: several runs that answer one question, so many at a time; the same call goes on where it was stopped.
+"""Studies: several runs that answer one question, done in parallel.
 
-What it leaves in its folder, as a figure does: a picture and its data.
+The same call resumes a study that was stopped. A study writes a picture and its data into its
+folder, like a figure.
 """
 
 from __future__ import annotations
@@ -56,27 +57,32 @@ from remodel_fenicsx.system.interrupts import Interrupted, PAUSE, StopRequest
 from remodel_fenicsx.system.terminal import Line
 from remodel_fenicsx.unloading import as_unloaded
 
-# ---------------------------------------------------------------- what a figure or a study leaves in its folder
-# A picture and its data. Each picture says what it was made with; what is to be said of tables stands in a file beside
-# them.
-MARK = "remodel_fenicsx figures"  # in every picture, and beside every table: what bears it may be drawn anew
+# ---------------------------------------------------------------- picture and tables of a figure
+# The metadata of each picture name the versions that made it. Notes on tables are in a JSON file.
+MARK = "remodel_fenicsx figures"  # in all pictures and notes; files with this mark may be replaced
 DOTS_PER_INCH = 200
-COLOURS = ("#1b4f9c", "#d1495b", "#2a9d6f", "#e09f3e", "#6c4f9c")  # apart in lightness too
+COLOURS = ("#1b4f9c", "#d1495b", "#2a9d6f", "#e09f3e", "#6c4f9c")  # they differ in lightness too
 STYLE = matplotlib.rc_params_from_file(
     Path(__file__).with_name("figures.mplstyle"), use_default_template=False
 )
 
 
 class Page:
-    """Collects the picture and the tables of one figure, and writes them."""
+    """Picture and tables of one figure in a folder, with their notes."""
 
     def __init__(self, folder: Path, name: str, title: str = "", caption: str = ""):
-        self.folder, self.name, self.title, self.caption = folder, name, title, caption
+        self.folder, self.name = folder, name
+        self.title, self.caption = title, caption
 
     def save_figure(self, figure: Figure, made_with: str) -> None:
-        """Write NAME.png; title, caption and what it was made with stand in the file."""
-        about = {"Software": f"{MARK} {__version__}", "Title": self.title, "Description": self.caption,
-                 "Source": f"{made_with}; matplotlib {matplotlib.__version__}", "Comment": self.name}  # fmt: skip
+        """Write NAME.png; its metadata have title, caption and the versions in `made_with`."""
+        about = {
+            "Software": f"{MARK} {__version__}",
+            "Title": self.title,
+            "Description": self.caption,
+            "Source": f"{made_with}; matplotlib {matplotlib.__version__}",
+            "Comment": self.name,
+        }
         drawn = io.BytesIO()
         figure.savefig(drawn, format="png", dpi=DOTS_PER_INCH, facecolor="white", metadata=about)
         self._write(f"{self.name}.png", drawn.getvalue())
@@ -84,7 +90,7 @@ class Page:
     def save_table(
         self, columns: Mapping[str, ArrayLike], notes: Sequence[str], part: str = ""
     ) -> None:
-        """Write NAME.csv or NAME-PART.csv, columns of one length under their names; the notes go into NAME.json."""
+        """Write columns of equal length to NAME.csv or NAME-PART.csv, and notes to NAME.json."""
         names, values = list(columns), [np.asarray(column) for column in columns.values()]
         text, file = io.StringIO(), f"{self.name}-{part}.csv" if part else f"{self.name}.csv"
         writer = csv.writer(text, lineterminator="\n")
@@ -92,12 +98,12 @@ class Page:
         for row in zip(*values, strict=True):
             writer.writerow([_cell(value) for value in row])
         _check_ours(self.folder / file, self.name)
-        said = {
+        about = {
             "made by": f"{MARK} {__version__}",
             "notes": read_notes(self.folder, self.name) | {file: list(notes)},
         }
         self._write(
-            f"{self.name}.json", (json.dumps(said, indent=1, ensure_ascii=False) + "\n").encode()
+            f"{self.name}.json", (json.dumps(about, indent=1, ensure_ascii=False) + "\n").encode()
         )
         self._write(file, text.getvalue().encode())
 
@@ -109,28 +115,28 @@ class Page:
 
 
 class StudyResult(ABC):
-    """What a study has found: `verdict` says it in a sentence, and stands over the picture and below the table."""
+    """Result of a study; its `verdict` is shown above the picture and below the table."""
 
-    name: str  # of its files
-    caption: str  # of its picture
-    scene: Scene  # that was asked for
+    name: str  # stem of the files
+    caption: str  # caption of the picture
+    scene: Scene  # the requested scene
     only_in_file: Sequence[str] = ()  # columns that a terminal does not show
     failed: Mapping[str, str] = {}
     notes: Sequence[str] = ()
 
-    about: str  # that a picture's title says beside the scene's name
+    about: str  # second half of the title, after the scene's name
 
     @property
     def title(self) -> str:
-        """Of the picture."""
+        """Title of the picture: the scene's name and `about`."""
         return f"{self.scene.name}: {self.about}"
 
     @abstractmethod
     def table(self) -> Mapping[str, ArrayLike]:
-        """Columns of NAME.csv."""
+        """Return the columns of NAME.csv by name."""
 
     def lines(self) -> list[str]:
-        """The table for a terminal."""
+        """Return the table for a terminal, a string for each line."""
         return aligned(
             {name: cells for name, cells in self.table().items() if name not in self.only_in_file},
             8,
@@ -139,18 +145,18 @@ class StudyResult(ABC):
 
     @abstractmethod
     def verdict(self) -> str:
-        """The answer in a sentence."""
+        """Return the result in one or a few sentences."""
 
     @abstractmethod
     def figure(self) -> Figure:
-        """The picture, without its head."""
+        """Draw the picture, without title and verdict."""
 
     def in_words(self) -> str:
-        """For a terminal."""
+        """Return table, verdict and notes for a terminal."""
         return "\n".join([*self.lines(), self.verdict(), *self.notes])
 
     def write(self, folder: Path) -> None:
-        """Write the table and the picture."""
+        """Write the table and the picture into a folder."""
         page = Page(folder, self.name, self.title, self.caption)
         page.save_table(self.table(), [self.title, *self.notes, made_with()])
         with rc_context(STYLE):
@@ -160,7 +166,10 @@ class StudyResult(ABC):
 
 
 def aligned(table: Mapping[str, ArrayLike | Sequence[str]], least: int, digits: int) -> list[str]:
-    """Columns under their names, each `least` wide or more: numbers to the right, text to the left."""
+    """Format columns with their names; numbers right-aligned, text left-aligned.
+
+    Each column is at least `least` characters wide.
+    """
     columns = []
     for name, values in table.items():
         cells = [
@@ -175,7 +184,7 @@ def aligned(table: Mapping[str, ArrayLike | Sequence[str]], least: int, digits: 
 
 
 def panels(number: int, height: float) -> tuple[Figure, list[Axes]]:
-    """A figure of so many panels, two beside each other, of this height in inches."""
+    """Make a figure with this number of panels, two in a row, of this height in inches."""
     rows = -(-number // 2)
     figure = Figure(figsize=(7.2, height * rows + 0.4), layout="constrained")
     grid = list(figure.subplots(rows, 2, squeeze=False).ravel())
@@ -185,31 +194,30 @@ def panels(number: int, height: float) -> tuple[Figure, list[Axes]]:
 
 
 def made_with() -> str:
-    """The libraries of this process."""
+    """Return the versions of the libraries in this process."""
     return ", ".join(f"{name} {version}" for name, version in versions().items() if name != "BLAS")
 
 
 def label(scene: Scene, name: str, unit: str = "") -> str:
-    """A column of the history in words, or a load, with its unit, that of the scene where it says one."""
+    """Return the label of a column or load, with its unit; by default the scene's unit, if any."""
     unit = unit or unit_of(scene, dimensions(scene).get(name, ""))
     return words(name) + (f", {unit}" if unit else "")
 
 
 def dimensions(scene: Scene) -> dict[str, str]:
-    """What loads and columns measure, those on request too, by name."""
+    """Return the dimensions of loads and columns by name, also of columns on request."""
     loads = {load: kind.dimension.name for load, kind in scene.load_kinds.items() if kind.dimension}
     columns = scene.columns(column.name for column in scene.geometry.columns_on_request)
     return loads | {column.name: column.unit for column in columns}
 
 
-HEAD_LETTER, HEAD_LINE = 0.0585, 0.155  # inches: mean letter and line of a head
-TICK_LABEL = (
-    0.14  # half of one at the end of an axis: which labels there are is settled after the layout
-)
+HEAD_LETTER, HEAD_LINE = 0.0585, 0.155  # inches: mean width of a letter, and line height
+# Inches: half of a tick label at the end of an axis. Tick labels are known only after the layout.
+TICK_LABEL = 0.14
 
 
 def add_head(figure: Figure, title: str, verdict: str) -> None:
-    """Write title and verdict over a figure of constrained layout, which becomes that much taller."""
+    """Write title and verdict above a figure with constrained layout, and increase its height."""
     wide, tall = figure.get_size_inches()
     lines = [title, *textwrap.wrap(verdict, int((wide - 0.16) / HEAD_LETTER))]
     figure.set_size_inches(wide, tall + HEAD_LINE * len(lines))
@@ -225,56 +233,57 @@ def _cell(value: str | SupportsFloat) -> str:
 def _check_ours(path: Path, name: str) -> None:
     if not path.exists():
         return
-    # tables of older versions begin with it
+    # Tables of older versions begin with the mark.
     if MARK.encode() not in path.read_bytes() and path.name not in read_notes(path.parent, name):
         raise FigureError(
-            f"{path}: is not a figure of this command and is not overwritten; choose another folder with -o"
+            f"{path}: is not a figure of this command and is not overwritten; "
+            "choose another folder with -o"
         )
 
 
 def read_notes(folder: Path, name: str) -> dict[str, list[str]]:
-    """What NAME.json says of each table of a figure, by the table's file; nothing where there is none."""
+    """Read the notes on the tables of a figure from NAME.json, by file name; empty if absent."""
     path = folder / f"{name}.json"
     text = path.read_text(encoding="utf-8", errors="replace") if path.is_file() else ""
     try:
         return dict(json.loads(text)["notes"]) if MARK in text else {}
-    except (ValueError, KeyError, TypeError):  # was cut short, or is somebody else's
+    except (ValueError, KeyError, TypeError):  # truncated, or a file of another program
         return {}
 
 
-# ---------------------------------------------------------------- one of the runs
-Found = TypeVar("Found", bound=StudyResult)
+# ---------------------------------------------------------------- a run of a study
+AnyResult = TypeVar("AnyResult", bound=StudyResult)
 
 POLL = 0.1  # seconds
-FEWEST_RUNS = 2  # runs, or settings, without which nothing is compared
+FEWEST_RUNS = 2  # smallest number of runs, or settings, that can be compared
 
 
-class TooFewRuns(RemodelError):  # noqa: N818 - what is recorded is whole, and the same call goes on
-    """Fewer than `FEWEST_RUNS` have reached the end, so that there is no answer yet."""
+class TooFewRuns(RemodelError):  # noqa: N818 - the recorded runs are complete, the study can resume
+    """Fewer than `FEWEST_RUNS` runs have reached the end, so that there is no result yet."""
 
     def __init__(
-        self, reached: str, failed: Mapping[str, str], advice: str = "the same command goes on"
+        self, reached: str, failed: Mapping[str, str], advice: str = "repeat the command to resume"
     ):
         super().__init__(
-            f"{reached}, at least {FEWEST_RUNS} are needed; all that is recorded is kept, {advice}"
+            f"{reached}, at least {FEWEST_RUNS} are needed; all recorded results are kept, {advice}"
         )
         self.failed, self.exit_code = dict(failed), SOLVE_FAILED if failed else PAUSED
 
 
 @dataclass(frozen=True)
 class Run:
-    """One of several runs."""
+    """A run of a study: its name, scene and folder."""
 
     name: str
     scene: Scene
     folder: Path
 
     def sibling_path(self, ending: str) -> Path:
-        """A file beside its folder, of the same name: names have dots of their own (`step-0.5`)."""
+        """Return the file next to the folder with this suffix; names may have dots (`step-0.5`)."""
         return self.folder.with_name(f"{self.folder.name}{ending}")
 
     def is_complete(self) -> bool:
-        """Whether this very scene is recorded to its end."""
+        """Return whether this scene is recorded to its end; raise if it is another scene."""
         if not all((self.folder / name).exists() for name in (SCENE, HISTORY)):
             return False
         recording = RecordedRun(self.folder)
@@ -284,7 +293,7 @@ class Run:
             )
         try:
             history = recording.history
-        except RecordingError:  # a last row that is not whole is done again
+        except RecordingError:  # An incomplete last row is computed again.
             return False
         times = history["time"]
         if not len(times) or not math.isclose(float(times[-1]), self.scene.last_time):
@@ -294,16 +303,16 @@ class Run:
             or (np.diff(times) <= 0).any()
         ):
             raise RecordingError(
-                f"{self.folder}: its history has other columns or rows than its scene asks for"
+                f"{self.folder}: columns or rows of its history are not those of its scene"
             )
         return True
 
     def history(self) -> HistoryColumns:
-        """What it has recorded."""
+        """Read the recorded history."""
         return read_history(self.folder)
 
     def begin(self, worker: Worker) -> None:
-        """Begin it, or go on with what is there of it."""
+        """Start the run in a worker, or resume it from its folder."""
         make_own_folder(self.folder.parent)
         check_no_link(self.folder)
         scene, words = self.sibling_path(".toml"), ["--resume", str(self.folder)]
@@ -314,23 +323,24 @@ class Run:
 
 
 def _same(recording: RecordedRun, wanted: Scene) -> bool:
-    """Whether it is of this scene: with the kinematics that "auto" took, its files by SHA-256 wherever they are."""
+    """Return whether a run is of this scene; "auto" is resolved, files are compared by SHA-256."""
     if recording.scene == wanted:
         return True
     try:
-        kept, _ = with_stored_files(recording.scene)
+        stored, _ = with_stored_files(recording.scene)
     except (SceneError, OSError) as error:
         words = refusal_in_words(error) if isinstance(error, OSError) else error
         raise RecordingError(f"{recording.path}: {words}") from error
-    with as_unloaded(wanted, MPI.COMM_SELF) as found:
-        return kept == with_stored_files(resolve_auto_settings(found))[0]
+    with as_unloaded(wanted, MPI.COMM_SELF) as unloaded:
+        return stored == with_stored_files(resolve_auto_settings(unloaded))[0]
 
 
-# ---------------------------------------------------------------- all of them
+# ---------------------------------------------------------------- all runs
 class Study:
-    """Runs in one folder, and the processes that do them, until it is closed."""
+    """Runs in one folder, and the processes that do them, until the study is closed."""
 
-    # A process does one run after the other, for most of a short run is its start. It ends with the command.
+    # A process does one run after another, because most of a short run is its start. All processes
+    # end with the command.
 
     def __init__(
         self,
@@ -341,7 +351,8 @@ class Study:
         jobs: int | None = None,
         quiet: bool = True,
     ):
-        self.name, self.scene, self.jobs, self.quiet = name, scene, jobs or cores(), quiet
+        self.name, self.scene = name, scene
+        self.jobs, self.quiet = jobs or cores(), quiet
         self.folder = Path(folder or Path("results") / f"{scene.name}-{name}")
         self.runs = [Run(run, changed, self.folder / run) for run, changed in scenes.items()]
         self.failed: dict[str, str] = {}
@@ -351,27 +362,27 @@ class Study:
         self._idle: list[Worker] = []
 
     def close(self) -> None:
-        """End the processes."""
+        """End the processes of all workers."""
         for worker in [*self._running, *self._idle]:
             worker.stop()
 
-    def run_and_write(self, answer: Callable[[], Found]) -> tuple[Path, Found]:
-        """The folder, and what the runs say once they are done, which is written there."""
+    def run_and_write(self, answer: Callable[[], AnyResult]) -> tuple[Path, AnyResult]:
+        """Do all runs, compute the result and write it; return the folder and the result."""
         with RunLock(self.folder), closing(self):
             self.run_all()
-            found = answer()
-            found.write(self.folder)
-        return self.folder, found
+            result = answer()
+            result.write(self.folder)
+        return self.folder, result
 
     def histories(self) -> dict[str, HistoryColumns]:
-        """Of all that have not failed, by name."""
+        """Read the histories of all runs that have not failed, by name."""
         return {run.name: run.history() for run in self.runs if run.name not in self.failed}
 
     def update(self) -> None:
-        """Do what is to be done whenever a run has ended."""
+        """Update the study at the start, and whenever a run has ended."""
 
     def run_all(self) -> None:
-        """Run what is not complete; `failed` then has the last words of those that have failed, or are damaged."""
+        """Do all incomplete runs; `failed` gets the last output of failed and corrupt ones."""
         self._waiting = [run for run in self.runs if self._is_left(run)]
         self.update()
         pausing = False
@@ -382,7 +393,7 @@ class Study:
                 if stop.pause and not pausing:
                     pausing = True
                     self._waiting.clear()
-                    for worker in self._running:  # each run ends with the step under way
+                    for worker in self._running:  # Each run ends after its current step.
                         worker.process.send_signal(PAUSE)
                 self._begin()
                 self._collect(pausing)
@@ -391,7 +402,7 @@ class Study:
             raise Interrupted(PAUSE)
 
     def _is_left(self, run: Run) -> bool:
-        """Whether it is to be run. One whose folder is damaged is not: nothing of the user's is removed."""
+        """Return whether a run is to be done: no if its folder is corrupt. Removes no files."""
         try:
             return not run.is_complete()
         except RecordingError as error:
@@ -399,11 +410,11 @@ class Study:
             return False
 
     def _begin(self) -> None:
-        """Begin runs until there are as many as jobs."""
+        """Start runs until their number is that of the jobs."""
         for run in list(self._waiting):
             if len(self._running) >= self.jobs:
                 return
-            # by another command, or one that was killed and is ending
+            # Another command is running it, or a killed one that is still ending.
             if run.folder.is_dir() and lock_holder(run.folder)[1]:
                 continue
             self._waiting.remove(run)
@@ -413,23 +424,23 @@ class Study:
                 run.begin(worker)
 
     def _collect(self, pausing: bool) -> None:
-        """Note how those have ended that have."""
+        """Collect the runs that have ended."""
         wait_for_one(self._running, POLL)
         for worker, run in list(self._running.items()):
             code = worker.poll()
             if code is None:
                 continue
             del self._running[worker]
-            if code != 0 and not (
-                pausing and code in (PAUSED, -PAUSE)
-            ):  # the latter before Python minds the signal
+            # -PAUSE: the signal came before Python had installed its handler.
+            if code != 0 and not (pausing and code in (PAUSED, -PAUSE)):
                 self.failed[run.name] = worker.last_output()
             if worker.is_alive:
                 self._idle.append(worker)
             self.update()
 
     def _progress(self) -> str:
-        """How many runs are behind, and which are under way."""
+        """Return the number of runs that have ended, and the names of the current ones."""
         done = len(self.runs) - len(self._waiting) - len(self._running)
         under_way = ", ".join(run.name for run in self._running.values())
-        return f"{done} of {len(self.runs)} runs done{f'; under way: {under_way}' if under_way else ''}"
+        text = f"{done} of {len(self.runs)} runs done"
+        return f"{text}; under way: {under_way}" if under_way else text

@@ -1,4 +1,4 @@
-"""`remodel-fenicsx sweep SCENE KEY=a:b:n ...` and `ensemble SCENE`: runs of a scene with other numbers, or seeds."""
+"""Commands `sweep` and `ensemble`: runs of a scene with other parameter values, or other seeds."""
 
 from __future__ import annotations
 
@@ -35,31 +35,35 @@ Point = Mapping[str, Number]
 
 OF_THE_SOLVER = ("time", "seconds", "newton_iterations", "linear_iterations", "substeps")
 RULE = (
-    "must be KEY=a:b:n (n numbers from a to b) or KEY=a,b,..., as in natural.opening_angle=0:160:5; "
-    f"n is a whole number from 2 to {MOST_RUNS}"
+    "must be KEY=a:b:n (n numbers from a to b) or KEY=a,b,..., as in "
+    f"natural.opening_angle=0:160:5; n is an integer from 2 to {MOST_RUNS}"
 )
 RANGE_RULE = "must be KEY=a:b with --latin, as in loads.pressure.value=2:6"
 
 
-# ---------------------------------------------------------------- which points
+# ---------------------------------------------------------------- points of a sweep
 def grid(axes: Mapping[str, Sequence[Number]]) -> list[dict[str, Number]]:
-    """All combinations, the last key fastest."""
+    """Return all combinations of the numbers; the last key varies fastest."""
     if (number := math.prod(map(len, axes.values()))) > MOST_RUNS:
-        raise SceneError(f"sweep: {number} runs; allowed are at most {MOST_RUNS}")
+        raise SceneError(f"sweep: {number} runs; must be at most {MOST_RUNS}")
     return [dict(zip(axes, numbers, strict=True)) for numbers in product(*axes.values())]
 
 
 def latin_hypercube(
     ranges: Mapping[str, Sequence[Number]], samples: int, seed: int = 1
 ) -> list[dict[str, Number]]:
-    """Points of which each `samples`-th part of each range has one, at a random place in it (McKay et al. 1979)."""
+    """Draw points by Latin hypercube sampling (McKay et al. 1979).
+
+    Each range is divided into `samples` intervals of equal width, and each interval has one point
+    at a random position.
+    """
     random = np.random.default_rng(seed)
-    shares = {
+    positions = {
         key: (random.permutation(samples) + random.random(samples)) / samples for key in ranges
     }
     return [
         {
-            key: float(f"{low + (high - low) * shares[key][number]:.6g}")
+            key: float(f"{low + (high - low) * positions[key][number]:.6g}")
             for key, (low, high) in ranges.items()
         }
         for number in range(samples)
@@ -67,21 +71,21 @@ def latin_hypercube(
 
 
 def read_axes(texts: Sequence[str], are_ranges: bool = False) -> dict[str, list[Number]]:
-    """Numbers by key of "KEY=a:b:n" or "KEY=a,b,..."; the two ends of "KEY=a:b" of ranges."""
+    """Read numbers by key from "KEY=a:b:n" or "KEY=a,b,...", or the ends of ranges "KEY=a:b"."""
     axes: dict[str, list[Number]] = {}
     for text in texts:
         key, numbers = _axis(text, are_ranges)
         if key in axes:
-            raise SceneError(f"sweep {key}: this key is given twice")
+            raise SceneError(f"sweep {key}: duplicate key")
         axes[key] = numbers
     return axes
 
 
 def _axis(text: str, is_range: bool) -> tuple[str, list[Number]]:
-    key, _, given = (part.strip() for part in text.partition("="))
-    has_ends = ":" in given
+    key, _, values = (part.strip() for part in text.partition("="))
+    has_ends = ":" in values
     try:
-        numbers = [_number(part) for part in given.split(":" if has_ends else ",")]
+        numbers = [_number(part) for part in values.split(":" if has_ends else ",")]
     except ValueError:
         numbers = []
     if is_range:
@@ -98,24 +102,24 @@ def _axis(text: str, is_range: bool) -> tuple[str, list[Number]]:
         spaced = np.linspace(numbers[0], numbers[1], int(numbers[2]))
         numbers = [_number(f"{number:.6g}" if number % 1 else f"{number:.0f}") for number in spaced]
     if len(set(numbers)) < len(numbers):
-        raise SceneError(f"sweep {format_value(text)}: a number is there twice")
+        raise SceneError(f"sweep {format_value(text)}: duplicate number")
     return key, numbers
 
 
 def _number(text: str) -> Number:
-    """A finite number; a whole one stays whole."""
+    """Read a finite number; an integer stays an integer."""
     if not math.isfinite(value := float(text)):
         raise ValueError(text)
     return int(text) if re.fullmatch(r"\s*[+-]?\d+\s*", text) else value
 
 
-# ---------------------------------------------------------------- a sweep: the last rows over the numbers
-PANEL_COLUMNS, PANEL_KEYS = 5, 3  # of the picture: what fits on a page
+# ---------------------------------------------------------------- last rows over the parameters
+PANEL_COLUMNS, PANEL_KEYS = 5, 3  # largest numbers of panels that fit on a page
 
 
 @dataclass(frozen=True)
 class Sweep(StudyResult):
-    """Numbers by key and histories of the runs; one that has failed has no history."""
+    """Parameter values and histories of the runs; a failed run has no history."""
 
     scene: Scene
     points: Mapping[str, Point]
@@ -123,16 +127,16 @@ class Sweep(StudyResult):
     failed: dict[str, str] = field(default_factory=dict)
 
     name = "sweep"
-    caption = "Each point is the end of one run; where one key varies a line joins them."
+    caption = "Each point is the end of one run; a line joins them if only one key varies."
 
     @property
     def about(self) -> str:  # type: ignore[override]
-        """What is shown."""
+        """Second half of the title: the number of runs."""
         return f"the last row of {len(self.points)} runs"
 
     @cached_property
     def values(self) -> dict[str, Array]:
-        """Numbers of the runs by key."""
+        """Parameter values of the runs, (runs,), by key."""
         points = list(self.points.values())
         return {
             key: np.array([point[key] for point in points], dtype=np.float64) for key in points[0]
@@ -140,7 +144,7 @@ class Sweep(StudyResult):
 
     @cached_property
     def ends(self) -> dict[str, Array]:
-        """Last rows of the runs by column; NaN where a run has failed."""
+        """Last rows of the runs, (runs,), by column; NaN for failed runs."""
         names = next(iter(self.histories.values()))
         ends = [
             [self.histories[run][n][-1] if run in self.histories else np.nan for n in names]
@@ -150,7 +154,7 @@ class Sweep(StudyResult):
 
     @cached_property
     def shown(self) -> list[str]:
-        """Columns that differ between the runs at the end, the shape's own first."""
+        """Columns that differ between the runs at the end, those of the shape first."""
         own = [column.name for column in self.scene.geometry.columns]
         spread = {
             name: np.nanmax(v) - np.nanmin(v)
@@ -163,25 +167,25 @@ class Sweep(StudyResult):
         return sorted(varying, key=lambda name: own.index(name) if name in own else len(own))
 
     def table(self) -> dict[str, Array]:
-        """The keys, then the last row of each history."""
+        """Return the columns of sweep.csv: the keys, then the last row of each history."""
         return self.values | self.ends
 
     def lines(self) -> list[str]:
-        """A row for each run."""
+        """Return the table for a terminal, with a row for each run."""
         return aligned(
             self.values | {name: self.ends[name] for name in self.shown[:PANEL_COLUMNS]}, 12, 6
         )
 
     def verdict(self) -> str:
-        """Between which ends the columns lie, and where."""
+        """Return minimum and maximum of the first columns, with their parameters, as a sentence."""
         parts = []
         for name in self.shown[:2]:
             ends = self.ends[name]
-            least, most = (
+            lowest, highest = (
                 f"{ends[run]:.4g} ({self._at(run)})"
                 for run in (np.nanargmin(ends), np.nanargmax(ends))
             )
-            parts.append(f"{name} from {least} to {most}")
+            parts.append(f"{name} from {lowest} to {highest}")
         if not parts:
             return "No column of the last row differs between the runs."
         return f"At the end of {len(self.histories)} runs: {'; '.join(parts)}."
@@ -190,7 +194,7 @@ class Sweep(StudyResult):
         return ", ".join(f"{key} {numbers[run]:g}" for key, numbers in self.values.items())
 
     def figure(self) -> Figure:
-        """Columns over keys."""
+        """Draw the columns over the keys, a panel for each pair."""
         keys, columns = list(self.values)[:PANEL_KEYS], self.shown[:PANEL_COLUMNS]
         figure = Figure(figsize=(7.2, 2.2 * max(1, len(columns)) + 0.4), layout="constrained")
         grid = figure.subplots(
@@ -213,9 +217,9 @@ def sweep(
     quiet: bool = True,
     sampled: bool = False,
 ) -> tuple[Path, Sweep]:
-    """Run a scene with other numbers; of points that were drawn those that are no scenes have failed."""
+    """Run a scene at each point. Points without a valid scene raise, or fail if `sampled`."""
     if not FEWEST_RUNS <= len(points) <= MOST_RUNS:
-        raise SceneError(f"sweep: {len(points)} runs; allowed are {FEWEST_RUNS} to {MOST_RUNS}")
+        raise SceneError(f"sweep: {len(points)} runs; must be {FEWEST_RUNS} to {MOST_RUNS}")
     named = {
         "_".join(f"{key}-{value:.10g}" for key, value in point.items()): point for point in points
     }
@@ -236,7 +240,7 @@ Swept = TypeVar("Swept", bound=Sweep)
 def _answered(
     kind: type[Swept], points: Mapping[str, Point], refused: Mapping[str, str], study: Study
 ) -> tuple[Path, Swept]:
-    """Do the runs of a sweep; at least `FEWEST_RUNS` of its points must reach the end."""
+    """Run a sweep; at least `FEWEST_RUNS` of its points must reach the end."""
     study.failed |= refused
 
     def answer() -> Swept:
@@ -249,35 +253,38 @@ def _answered(
 
 
 def _changed(scene: Scene, point: Point) -> Scene:
-    """With the numbers of a point; some keys take them and mean something else."""
-    found = scene.with_values({**point, "output.fields": False})
+    """Return the scene at a point. Some keys accept numbers but do not store them; these raise."""
+    changed = scene.with_values({**point, "output.fields": False})
     for key, value in point.items():
-        there: Any = found
+        there: Any = changed
         for part in key.split("."):
             there = there[part] if isinstance(there, Mapping) else getattr(there, part)
         if there != value:
             raise SceneError(f"sweep {key}: this key does not take a number")
-    return found
+    return changed
 
 
-# ---------------------------------------------------------------- an ensemble: a sweep of seeds
-PANELS = 6
+# ---------------------------------------------------------------- sweeps of seeds
+PANELS = 6  # largest number of panels that fit on a page
 
 
 class Ensemble(Sweep):
-    """A sweep whose axis is the seed."""
+    """A sweep of the seed of random cells."""
 
     name = "ensemble"
-    caption = "Lines: means over the seeds; dark: mean and one standard deviation; light: least and most of all seeds."
+    caption = (
+        "Lines: means over the seeds; dark: mean and one standard deviation; "
+        "light: minimum to maximum of all seeds."
+    )
 
     @property
     def about(self) -> str:  # type: ignore[override]
-        """What is shown."""
+        """Second half of the title: the number of seeds."""
         return f"{len(self.histories)} seeds of random cells"
 
     @cached_property
     def statistics(self) -> dict[str, dict[str, Array]]:
-        """Of each column over the seeds, at each time."""
+        """Mean, standard deviation, minimum and maximum over the seeds, (times,), by column."""
         runs = [*self.histories.values()]
         columns = {
             name: np.array([run[name] for run in runs])
@@ -286,31 +293,31 @@ class Ensemble(Sweep):
         }
         kinds: dict[str, Any] = {
             "mean": np.mean,
-            "deviation": partial(np.std, ddof=1),
-            "least": np.min,
-            "most": np.max,
+            "std": partial(np.std, ddof=1),
+            "min": np.min,
+            "max": np.max,
         }
         return {
             name: {kind: of(v, axis=0) for kind, of in kinds.items()} for name, v in columns.items()
         }
 
     def table(self) -> dict[str, Array]:
-        """Of each column mean, standard deviation, least and most."""
+        """Return the columns of ensemble.csv: NAME_mean, NAME_std, NAME_min and NAME_max."""
         columns = self.statistics.items()
-        found = {
+        statistics = {
             f"{name}_{kind}": values for name, kinds in columns for kind, values in kinds.items()
         }
-        return {"time": next(iter(self.histories.values()))["time"], **found}
+        return {"time": next(iter(self.histories.values()))["time"], **statistics}
 
     def lines(self) -> list[str]:
-        """The columns that differ between seeds, at the end."""
+        """Return the table for a terminal: columns that differ between seeds, at the end."""
         rows: dict[str, Any] = {f"{len(self.histories)} seeds": self.shown}
-        for kind in ("mean", "deviation", "least", "most"):
+        for kind in ("mean", "std", "min", "max"):
             rows[kind] = [self.statistics[name][kind][-1] for name in self.shown]
         return aligned(rows, 11, 5)
 
     def verdict(self) -> str:
-        """What the end of the first columns is, and how far seeds are apart."""
+        """Return mean and standard deviation of the first columns at the end as a sentence."""
         time, seeds = f"At time {self.table()['time'][-1]:g}", len(self.histories)
         if not self.shown:
             return f"{time} no column differs between the {seeds} seeds."
@@ -319,26 +326,24 @@ class Ensemble(Sweep):
             for name in self.shown[:2]
         ]
         parts = [
-            f"{name} is {mean:.4g}, with a standard deviation of {deviation:.2g}"
-            for name, mean, deviation, *_ in ends
+            f"{name} is {mean:.4g}, with a standard deviation of {std:.2g}"
+            for name, mean, std, *_ in ends
         ]
         means = "; ".join(only_for_means(self.scene))
-        note = f" The deviations are not those of the whole body: {means}." if means else ""
-        return f"{time}, mean of {seeds} seeds: {'; '.join(parts)}.{note}"
+        note = f" The standard deviations are not those of the whole body: {means}."
+        return f"{time}, mean of {seeds} seeds: {'; '.join(parts)}.{note if means else ''}"
 
     def figure(self) -> Figure:
-        """Columns that differ between seeds, over time."""
+        """Draw the columns that differ between seeds over time, a panel for each."""
         (figure, grid), time = panels(len(self.shown[:PANELS]), 2.2), self.table()["time"]
         for axes, name in zip(grid, self.shown, strict=False):
-            mean, deviation, least, most = self.statistics[name].values()
+            mean, std, lowest, highest = self.statistics[name].values()
             band: dict[str, Any] = {"color": COLOURS[0], "linewidth": 0}
             axes.plot(time, mean, color=COLOURS[0], label="random cells, mean over the seeds")
             words = "mean and one standard deviation"
+            axes.fill_between(time, mean - std, mean + std, alpha=0.35, label=words, **band)
             axes.fill_between(
-                time, mean - deviation, mean + deviation, alpha=0.35, label=words, **band
-            )
-            axes.fill_between(
-                time, least, most, alpha=0.15, label="least to most of all seeds", **band
+                time, lowest, highest, alpha=0.15, label="minimum to maximum of all seeds", **band
             )
             axes.set(xlabel="time", ylabel=label(self.scene, name), xlim=(0, time[-1]))
         if self.shown:
@@ -353,16 +358,17 @@ def ensemble(
     jobs: int | None = None,
     quiet: bool = True,
 ) -> tuple[Path, Ensemble]:
-    """Run a scene with many seeds, from its own on."""
+    """Run a scene with many consecutive seeds, starting from its own."""
     if seeds < FEWEST_RUNS:
-        raise SceneError(f"--seeds {seeds}: allowed is a whole number at least {FEWEST_RUNS}")
+        raise SceneError(f"--seeds {seeds}: must be an integer of at least {FEWEST_RUNS}")
     if not scene.has_random_cells:
         raise SceneError(
             f"cells.initial = {scene.cells.initial!r}: an ensemble needs 'random' cells"
         )
     if scene.time.is_adaptive:
         raise SceneError(
-            f"time.tolerance = {scene.time.tolerance:g}: each seed would have other steps; leave it out"
+            f"time.tolerance = {scene.time.tolerance:g}: each seed would have other steps; "
+            "leave it out"
         )
     first = scene.cells.seed
     points = {f"seed-{n}": {"cells.seed": n} for n in range(first, first + seeds)}

@@ -1,4 +1,4 @@
-"""`remodel-fenicsx trade SCENE`: what each setting of a scene costs, and how far it is from the finest one."""
+"""Command `trade`: cost and error of the numerical settings of a scene."""
 
 from __future__ import annotations
 
@@ -28,21 +28,21 @@ from remodel_fenicsx.system.files import make_own_folder, write_whole
 log = logging.getLogger(__name__)
 
 
-# ---------------------------------------------------------------- settings of a scene from coarse to fine
-DEGREES_PER_RUN = 60.0  # what angles turn by: steps of a tolerance are about so many tolerances
-STEPS = (8.0, 5.0, 4.0, 2.5, 2.0, 0.5, 0.25, 0.125)  # in the scene's own
+# ---------------------------------------------------------------- settings, from coarse to fine
+DEGREES_PER_RUN = 60.0  # typical rotation of angles in a run: a step is about one tolerance of it
+STEPS = (8.0, 5.0, 4.0, 2.5, 2.0, 0.5, 0.25, 0.125)  # factors on the scene's step
 TOLERANCES = (2.0, 1.0, 0.5, 0.25)  # degrees
 MESHES = [
     *product((1, 2, 4), (1, 2), (1.0, 0.25))
-]  # refinement in the scene's own, degree, step in the scene's own
-SEEDS = 3  # of random cells
-COMPARED = 9  # times at which rows are compared, the last is the end
+]  # factor on the scene's refinement, degree, factor on the scene's step
+SEEDS = 3  # number of seeds of random cells
+COMPARED = 9  # number of times at which histories are compared, the last is the end
 KINEMATIC = "model.kinematics"
 
 
 @dataclass(frozen=True, eq=False)
 class Setting:
-    """One row of the table: a scene that a user could take."""
+    """A numerical setting: a scene that a user could run, and its seeds."""
 
     name: str
     scene: Scene
@@ -50,30 +50,30 @@ class Setting:
 
     @property
     def step(self) -> float:
-        """The fixed step; infinite with a tolerance."""
+        """Fixed step size; infinite for adaptive time stepping."""
         return self.scene.time.step if self.scene.time.tolerance is None else np.inf
 
     @property
     def element(self) -> float:
-        """Size of the elements over their degree, the coarsest 1."""
+        """Relative element size over the squared degree; 1 for the coarsest setting."""
         return 1.0 / (self.scene.mesh.refinement * self.scene.mesh.degree**2)
 
     @property
     def cost(self) -> float:
-        """What orders them: about in proportion to the time of one run."""
+        """Estimated cost, about proportional to the CPU time of one run."""
         time = self.scene.time
         steps = time.number_of_steps if time.tolerance is None else DEGREES_PER_RUN / time.tolerance
         return step_cost(self.scene, self.scene.model.kinematics) * steps
 
 
 def ladder(scene: Scene) -> list[Setting]:
-    """All settings that the scene allows, each once, the cheapest first."""
+    """Return all settings that the scene allows, each once, cheapest first."""
     cheapest = choice(scene.with_values({KINEMATIC: AUTO})).name
-    # without its profile, which would choose the steps of every row; what the profile has set stays
+    # Without its profile, which would set the step of every row. Values set by the profile stay.
     base = scene.with_values({KINEMATIC: cheapest, "time.tolerance": None, "profile": None})
     number = SEEDS if base.has_random_cells else 1
     seeds = tuple(range(base.cells.seed, base.cells.seed + number))
-    found: dict[str, Setting] = {}
+    settings: dict[str, Setting] = {}
     for profile, values in _wanted(scene, base):
         if (
             isinstance(base.geometry, FromFile)
@@ -82,21 +82,24 @@ def ladder(scene: Scene) -> list[Setting]:
             values = {key: value for key, value in values.items() if not key.startswith("mesh.")}
         try:
             changed = base.with_values(values)
-        except (
-            SceneError
-        ) as error:  # a step of which a corner is no multiple, an element that a formulation has not
+        # Corners of ramps are no multiples of the step, or the formulation lacks the element.
+        except SceneError as error:
             log.debug("left out: %s", error)
             continue
         time = changed.time
         steps = f"step-{time.step:g}" if time.tolerance is None else f"tolerance-{time.tolerance:g}"
-        name = f"{changed.model.kinematics}-{changed.mesh.refinement}-degree-{changed.mesh.degree}-{steps}"
-        found.setdefault(name, Setting(f"profile-{profile}" if profile else name, changed, seeds))
-    return sorted(found.values(), key=lambda setting: setting.cost)
+        mesh = f"{changed.mesh.refinement}-degree-{changed.mesh.degree}"
+        name = f"{changed.model.kinematics}-{mesh}-{steps}"
+        settings.setdefault(
+            name, Setting(f"profile-{profile}" if profile else name, changed, seeds)
+        )
+    return sorted(settings.values(), key=lambda setting: setting.cost)
 
 
 def _wanted(scene: Scene, base: Scene) -> Iterator[tuple[str, dict[str, Any]]]:
     """Yield the name of a profile, or nothing, and the values of each setting."""
-    own, step, remodels = base.model.kinematics, base.time.step, LAWS[scene.remodeling.law].remodels
+    own, step = base.model.kinematics, base.time.step
+    remodels = LAWS[scene.remodeling.law].remodels
     yield "", {}
     for name in PROFILES if remodels else ():
         values = profile_for(name, base).settings(base)
@@ -120,7 +123,7 @@ def _wanted(scene: Scene, base: Scene) -> Iterator[tuple[str, dict[str, Any]]]:
 
 
 def compared_lengths(scene: Scene) -> tuple[str, list[str]]:
-    """What the lengths of a body are called, and its columns of them: radii, or the stretch of what has none."""
+    """Return the name and the columns of the lengths to compare: radii, stretch or volume."""
     columns = scene.geometry.columns
     if radii := [column.name for column in columns if column.unit == "length"]:
         return "radii", radii
@@ -133,8 +136,8 @@ def compared_lengths(scene: Scene) -> tuple[str, list[str]]:
 
 
 def as_run(setting: Setting, seed: int = 1) -> Scene:
-    """The scene of a run of the study: only what is compared is measured."""
-    columns = [*compared_lengths(setting.scene)[1], "processor_seconds", *PROFILE]
+    """Return the scene of a run that records only the compared columns."""
+    columns = [*compared_lengths(setting.scene)[1], "cpu_seconds", *PROFILE]
     values = {
         "output.fields": False,
         "output.columns": columns,
@@ -146,14 +149,14 @@ def as_run(setting: Setting, seed: int = 1) -> Scene:
     )
 
 
-# ---------------------------------------------------------------- errors against the finest
-NOISY = 2.0  # noise of the mean over the seeds that an error must be above
-FINER = 1.99  # how much finer steps and elements of the finest must be than those of a row that is trusted
+# ---------------------------------------------------------------- errors relative to the finest
+NOISY = 2.0  # smallest trusted error, over the noise of the mean over the seeds
+FINER = 1.99  # smallest ratio of a trusted setting's steps and elements to those of the finest
 
 
 @dataclass(frozen=True)
 class Result:
-    """What the runs of a setting give, (seeds, columns, times), and the processor seconds of one of them."""
+    """Results of the runs of a setting, (seeds, columns, times), and the CPU seconds of one run."""
 
     setting: Setting
     angles: Array
@@ -162,7 +165,7 @@ class Result:
 
 
 class Row(NamedTuple):
-    """A row of the table."""
+    """A row of the table: the errors and the cost of a setting."""
 
     setting: Setting
     angle_error: float
@@ -173,12 +176,15 @@ class Row(NamedTuple):
 
 
 def nanrms(values: Array) -> float:
-    """Root mean square of what is known."""
+    """Return the root mean square of the values that are not NaN."""
     return float(np.sqrt(np.nanmean(values**2)))
 
 
 def pareto(costs: Sequence[float], errors: Sequence[float]) -> list[bool]:
-    """Which of some settings no other one beats in cost and error, to two digits: timings are not known to more."""
+    """Return which settings are Pareto-optimal in cost and error, rounded to two digits.
+
+    Timings are not reproducible to more digits.
+    """
     pairs = [
         (float(f"{cost:.2g}"), float(f"{error:.2g}"))
         for cost, error in zip(costs, errors, strict=True)
@@ -191,7 +197,10 @@ def pareto(costs: Sequence[float], errors: Sequence[float]) -> list[bool]:
 
 
 def compared(results: Sequence[Result]) -> list[Row]:
-    """Rows with errors against the finest one, the cheapest first; the error of the finest is not known."""
+    """Return rows with errors relative to the finest setting, cheapest first.
+
+    The error of the finest setting is NaN.
+    """
     finest = min(results, key=lambda result: result.setting.step * result.setting.element)
     rows = [_row(result, finest) for result in sorted(results, key=lambda result: result.seconds)]
     on_front = pareto([row.seconds for row in rows], [row.angle_error for row in rows])
@@ -201,12 +210,14 @@ def compared(results: Sequence[Result]) -> list[Row]:
 def _row(result: Result, finest: Result) -> Row:
     setting, seeds = result.setting, len(result.angles)
     if result is finest:
-        return Row(setting, np.nan, np.nan, result.seconds, "the others are compared with it")
-    apart = result.angles - finest.angles  # seed by seed: steps are compared on the same cells
+        return Row(
+            setting, np.nan, np.nan, result.seconds, "the other settings are compared with it"
+        )
+    # The difference is taken seed by seed, so that both settings have the same cells.
+    apart = result.angles - finest.angles
     noise = nanrms(np.std(apart, axis=0, ddof=1)) / seeds**0.5 if seeds > 1 else 0.0
-    error, ratio = nanrms(np.mean(apart, axis=0)), np.mean(result.lengths, axis=0) / np.mean(
-        finest.lengths, axis=0
-    )
+    error = nanrms(np.mean(apart, axis=0))
+    ratio = np.mean(result.lengths, axis=0) / np.mean(finest.lengths, axis=0)
     sizes = {"steps": (setting.step, finest.setting.step)}
     if not KINEMATICS[setting.scene.model.kinematics].homogeneous:
         sizes["elements"] = setting.element, finest.setting.element
@@ -225,13 +236,13 @@ def trade(
     jobs: int | None = None,
     quiet: bool = True,
 ) -> tuple[Path, Trade]:
-    """Run a scene with a ladder of settings, within a budget of seconds, and compare each with the finest."""
+    """Run a scene with all settings, within a budget in seconds; compare each with the finest."""
     study = _TradeStudy(scene, folder, budget, jobs, quiet)
     return study.run_and_write(study.answer)
 
 
 class _TradeStudy(Study):
-    """Runs in the order of their cost, within a budget."""
+    """A study that does its runs in the order of their cost, within a budget."""
 
     def __init__(self, scene: Scene, folder: Path | str | None, budget: float, *how: Any):
         deadline = clock.monotonic() + budget
@@ -245,17 +256,21 @@ class _TradeStudy(Study):
 
     @property
     def left(self) -> list[Setting]:
-        """Settings that have neither ended nor failed."""
+        """Settings without a result that have not failed."""
         done = {*self._results, *map(self.settings.get, self.failed)}
         return [setting for setting in dict.fromkeys(self.settings.values()) if setting not in done]
 
     def answer(self) -> Trade:
-        """The table of what was run."""
+        """Return the table of the settings that were run."""
         if len(self._results) < FEWEST_RUNS:
             reached = (
                 f"{len(self._results)} of {len({*self.settings.values()})} settings reached the end"
             )
-            advice = "a larger budget goes on" if self.left else "the same command tries again"
+            advice = (
+                "set a larger budget to continue"
+                if self.left
+                else "repeat the command to run them again"
+            )
             raise TooFewRuns(
                 f"{reached} within the budget of {self.budget:g} s", self.failed, advice
             )
@@ -264,37 +279,36 @@ class _TradeStudy(Study):
         return Trade(self.scene, compared([*self._results.values()]), notes, self.failed)
 
     def update(self) -> None:
-        """Read what is new."""
+        """Read the results of settings whose runs are complete."""
         for setting in self.left:
             runs = [run for run in self.runs if self.settings[run.name] is setting]
-            with suppress(
-                RecordingError
-            ):  # one that is damaged will be among those that have failed
+            # A run with a corrupt folder is listed in `failed` later.
+            with suppress(RecordingError):
                 if all(run.is_complete() for run in runs):
                     self._results[setting] = read(setting, [run.history() for run in runs])
 
 
 def read(setting: Setting, histories: Sequence[Mapping[str, Array]]) -> Result:
-    """What is compared of the runs of a setting, between rows on the straight line."""
+    """Return the compared quantities of a setting's runs, interpolated linearly in time."""
     times = np.linspace(0.0, setting.scene.last_time, COMPARED + 1)[1:]
 
     def columns(names: Sequence[str]) -> Array:
         return np.array(
-            [[np.interp(times, each["time"], each[name]) for name in names] for each in histories]
+            [[np.interp(times, run["time"], run[name]) for name in names] for run in histories]
         )
 
-    seconds = float(np.mean([np.nansum(each["processor_seconds"]) for each in histories]))
+    seconds = float(np.mean([np.nansum(run["cpu_seconds"]) for run in histories]))
     return Result(setting, columns(PROFILE), columns(compared_lengths(setting.scene)[1]), seconds)
 
 
-# ---------------------------------------------------------------- the answer: words, a table, a picture, scenes
+# ---------------------------------------------------------------- verdict, table, picture, scenes
 ROWS = "rows"  # folder of the scenes
-WANTED = 1.0  # degrees of error, which the verdict asks for: less than what random cells scatter
+WANTED = 1.0  # degrees: error that the verdict asks for, below the scatter of random cells
 
 
 @dataclass(frozen=True)
 class Trade(StudyResult):
-    """The table."""
+    """Errors and costs of the settings of a scene."""
 
     scene: Scene
     rows: list[Row]
@@ -306,11 +320,11 @@ class Trade(StudyResult):
     only_in_file = "scene", "trusted"
 
     def table(self) -> dict[str, list[Any]]:
-        """A row for each setting."""
+        """Return the columns of trade.csv, with a row for each setting."""
         rows = [
-            (one.setting.name, f"{ROWS}/{one.setting.name}.toml", one.angle_error, one.length_error, one.seconds,
-             int(one.on_front), int(not one.doubt), one.doubt)
-            for one in self.rows
+            (row.setting.name, f"{ROWS}/{row.setting.name}.toml", row.angle_error, row.length_error,
+             row.seconds, int(row.on_front), int(not row.doubt), row.doubt)
+            for row in self.rows
         ]  # fmt: skip
         lengths = f"error_{compared_lengths(self.scene)[0]}"
         names = (
@@ -326,33 +340,34 @@ class Trade(StudyResult):
         return dict(zip(names, map(list, zip(*rows, strict=True)), strict=True))
 
     def verdict(self) -> str:
-        """What `WANTED` degrees cost."""
+        """Return the cheapest trusted setting with an error of at most `WANTED` degrees."""
         trusted = [row for row in self.rows if not row.doubt]
         good = [row for row in trusted if row.angle_error <= WANTED]
         if not trusted:
             return f"Not known: all {len(self.rows)} errors are doubted; trade.csv says why."
         best = min(good or trusted, key=lambda row: (row.seconds if good else 0.0, row.angle_error))
-        cost = (
-            f"{best.seconds:.2g} s of the processor for an error of {best.angle_error:.2g} degrees"
-        )
+        cost = f"{best.seconds:.2g} s of CPU time for an error of {best.angle_error:.2g} degrees"
         if not good:
-            return f"No setting is known to be within {WANTED:g} degree; the closest is {best.setting.name}, {cost}."
-        return f"The cheapest setting within {WANTED:g} degree is {best.setting.name}, {cost}."
+            text = f"No setting is known to be within {WANTED:g} degree; the closest is "
+        else:
+            text = f"The cheapest setting within {WANTED:g} degree is "
+        return f"{text}{best.setting.name}, {cost}."
 
     def write(self, folder: Path) -> None:
-        """Write the table, the picture, and a scene of each row."""
+        """Write the table, the picture and the scene of each row."""
         make_own_folder(folder / ROWS)
         for row, file in zip(self.rows, self.table()["scene"], strict=True):
-            header = f"{row.setting.name} of {self.scene.name}, {row.seconds:.2g} s; ../trade.csv has its errors"
+            header = f"{row.setting.name} of {self.scene.name}, {row.seconds:.2g} s; "
+            header += "../trade.csv has its errors"
             write_whole(folder / file, row.setting.scene.to_toml(header).encode())
         super().write(folder)
 
     def figure(self) -> Figure:
-        """Cost against error; beside the axes stands what the front is."""
+        """Plot error over cost; the legend names the settings on the Pareto front."""
         known = [row for row in self.rows if row.angle_error > 0]
         figure = Figure(figsize=(7.2, 4.2), layout="constrained")
         axes = figure.subplots()
-        axes.set(xscale="log", yscale="log", xlabel="seconds of the processor")
+        axes.set(xscale="log", yscale="log", xlabel="CPU time, seconds")
         axes.set(ylabel="error of the fibre angle, degrees")
         for axis in (axes.xaxis, axes.yaxis):
             axis.set_major_formatter("{x:g}")

@@ -29,7 +29,7 @@ def stiff_cube(**remodeling: Any) -> dict[str, Any]:
         None, "point", geometry={"shape": "cube", "side": 1.0}, material={"lame_mu": 1e6, "lame_lambda": 1e6},
         loads={"force": {"value": 10.0, "ramp": [[0.0, 1.0]]}}, time={"end": 20.0, "step": 1.0},
         remodeling={"law": "tensor", "coupling": "staggered", "kappa": 0.02} | remodeling,
-        output={"fields": False, "columns": ["asleep_share", "mean_fibre_angle"]},
+        output={"fields": False, "columns": ["inactive_fraction", "mean_fibre_angle"]},
     )  # fmt: skip
 
 
@@ -44,7 +44,7 @@ def test_the_lazy_zone_slows_and_stops(coupling: str) -> None:
     assert slow["mean_fibre_angle"] < start - 3 and asleep["mean_fibre_angle"] == pytest.approx(
         start, abs=1e-9
     )
-    assert (slow["asleep_share"], asleep["asleep_share"]) == (0.0, 1.0)
+    assert (slow["inactive_fraction"], asleep["inactive_fraction"]) == (0.0, 1.0)
     with np.errstate(all="raise"):
         assert tensor_law.activation(np.diag([1e-300, 0.0, -1.0])[None], 1e60) == 0
 

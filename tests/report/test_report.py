@@ -267,7 +267,7 @@ def test_an_artery_costs_little(recorded: Recorded, tmp_path: Path) -> None:
         few = Decoded(page.page_of(Recording(folder), size))
         kept = few.view["times"]
         assert kept[0] == 0.0 and kept[-1] == 10.0 and 2 <= len(kept) <= max(2, number)
-        assert "recorded times are kept" in few.text
+        assert "recorded times are stored" in few.text
 
 
 def test_kept_times_are_spread_evenly() -> None:
@@ -308,7 +308,7 @@ def folder(tmp_path: Path) -> Path:
 
 
 @pytest.mark.parametrize(("lines", "rows", "state", "words"), [
-    ("", "", "stopped", "at t = 2 of 10, without a word: it was killed"),
+    ("", "", "stopped", "at t = 2 of 10: it was killed, and logged no reason"),
     ("INFO failed: time 3: limit point. a lower load", "", "failed", "time 3: limit point. a lower load"),
     ("INFO ended: SIGTERM", "", "stopped", "at t = 2 of 10: SIGTERM"),
     ("INFO finished", "10,250,1.5,\n", "finished", ""),

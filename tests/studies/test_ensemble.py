@@ -75,8 +75,7 @@ def test_the_table_is_that_of_the_runs(made: tuple[Path, study.Ensemble]) -> Non
     assert [run.scene.cells.seed for run in runs] == [1, 3]
     rows = list(csv.DictReader((folder / "ensemble.csv").read_text().splitlines()))
     found = [
-        [float(row[f"mean_stretch_{kind}"]) for row in rows]
-        for kind in ("mean", "deviation", "most")
+        [float(row[f"mean_stretch_{kind}"]) for row in rows] for kind in ("mean", "std", "max")
     ]
     one, two = (run.history["mean_stretch"] for run in runs)
     expected = [(one + two) / 2, np.abs(one - two) / 2**0.5, np.maximum(one, two)]
@@ -91,7 +90,7 @@ def test_two_seeds_are_needed(tmp_path: Path) -> None:
         (tmp_path / f"seed-{seed}").write_text("a file of the user's\n")
     with (
         forked_children(),
-        pytest.raises(TooFewRuns, match="1 of 3 runs reached the end, .* is kept") as too_few,
+        pytest.raises(TooFewRuns, match="1 of 3 runs reached the end, .* are kept") as too_few,
     ):
         study.ensemble(pulled_cube(1.0), tmp_path, seeds=3)
     assert list(too_few.value.failed) == ["seed-2", "seed-3"] and too_few.value.exit_code == 3
@@ -152,7 +151,7 @@ def test_bad_input_is_one_line(tmp_path: Path, refused: Refused) -> None:
         scene(output={"fields": False}).with_values({"cells.initial": "isotropic"}).to_toml()
     )
     assert "an ensemble needs 'random' cells" in refused("ensemble", path, "-o", tmp_path / "out")
-    assert "--seeds 1: allowed is a whole number at least 2" in refused(
+    assert "--seeds 1: must be an integer of at least 2" in refused(
         "ensemble", path, "--seeds", "1"
     )
     assert not (tmp_path / "out").exists()
@@ -161,4 +160,4 @@ def test_bad_input_is_one_line(tmp_path: Path, refused: Refused) -> None:
 def test_seeds_of_a_quarter_say_that_their_deviations_are_not_those_of_the_whole() -> None:
     tube = {"preset": "kuhl-holzapfel-2007", "profile": "balanced", "geometry": {"shape": "tube"}}
     found = of_seeds(scene_from_dict(tube), {"outer_radius": np.eye(6)[:, 4:]})
-    assert "The deviations are not those of the whole body: 'sector': " in found.verdict()
+    assert "The standard deviations are not those of the whole body: 'sector': " in found.verdict()

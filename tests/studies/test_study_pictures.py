@@ -45,8 +45,8 @@ def the_trade(noise: float) -> StudyResult:
     (the_ensemble, 3, {"outer radius, mm"}),
     (the_analysis, -0.5, {"factor of one pass on a\nsmall change of the cells"}),
     (the_analysis, -300.0, {"time"}),
-    (the_trade, 0.0, {"seconds of the processor", "error of the fibre angle, degrees"}),
-    (the_trade, 0.3, {"seconds of the processor"}),
+    (the_trade, 0.0, {"CPU time, seconds", "error of the fibre angle, degrees"}),
+    (the_trade, 0.3, {"CPU time, seconds"}),
 ])  # fmt: skip
 def test_a_picture_says_its_answer_and_every_word_can_be_read(
     study: Callable[[float], StudyResult],
@@ -87,7 +87,9 @@ def test_the_verdict_on_settings_is_that_of_trusted_ones() -> None:
     rows = compared()
     good = [row for row in rows if row.angle_error <= 1.0 and not row.doubt]
     cheapest = min(good, key=lambda row: (row.seconds, row.angle_error))
-    said = f"{cheapest.seconds:.2g} s of the processor for an error of {cheapest.angle_error:.2g} degrees."
+    said = (
+        f"{cheapest.seconds:.2g} s of CPU time for an error of {cheapest.angle_error:.2g} degrees."
+    )
     verdict = Trade(artery(), rows).verdict()
     assert verdict.startswith("The cheapest setting within 1 degree is ") and verdict.endswith(said)
     others = [row._replace(doubt="noise") if row is cheapest else row for row in rows]

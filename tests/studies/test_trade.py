@@ -53,7 +53,7 @@ def test_errors_are_differences_from_the_finest_and_trusted_where_that_is_finer_
         if name == finest.setting.name:
             assert (
                 np.isnan(row.angle_error)
-                and row.doubt == "the others are compared with it"
+                and row.doubt == "the other settings are compared with it"
                 and not row.on_front
             )
             continue
@@ -212,7 +212,7 @@ def test_the_command(
         and "0 of 4 settings reached the end within the budget of 0.001 s, at least 2 are needed"
         in said
     )
-    assert "a larger budget goes on" in said
+    assert "set a larger budget to continue" in said
 
 
 @pytest.mark.slow

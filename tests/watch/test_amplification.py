@@ -82,16 +82,16 @@ def test_the_command_writes_table_and_picture(
 @pytest.mark.parametrize(("factors", "words"), [
     ([-0.5, 0.2, 1.0], "Stable: at all 3 times a pass makes small changes of the cells smaller, or keeps them."),
     ([-0.5, -1.5, -3.0], "Unstable: at 2 of 3 times a pass makes small changes of the cells larger, first at 2; the "
-     "worst by a factor of -3, at time 3. The coupling 'relaxed' with a relaxation_factor below 0.5 damps what "
-     "swings."),
+     "worst by a factor of -3, at time 3. The coupling 'relaxed' with a relaxation_factor below 0.5 damps the "
+     "oscillation."),
     ([-0.5, 1.2], "Unstable: at 1 of 2 times a pass makes small changes of the cells larger, first at 2; the "
      "worst by a factor of 1.2, at time 2."),
-    ([-0.5, np.nan], "Not known: at 1 of 2 times no factor was found; stable at all others."),
+    ([-0.5, np.nan], "Unknown: at 1 of 2 times the factor could not be computed; stable at all other times."),
 ])  # fmt: skip
 def test_the_verdict(factors: list[float], words: str) -> None:
     by_time = {number + 1.0: factor for number, factor in enumerate(factors)}
     scene = preset_scene(PAPER, "cube")
     assert Analysis(scene, by_time, "full", 1.0).verdict() == words
     assert "relaxation_factor below 0.25" in Analysis(scene, {1.0: -3.0}, "full", 0.5).verdict()
-    unseen = " But kinematics 'point' sees changes that keep its symmetry only; 'full' sees all."
+    unseen = " But kinematics 'point' shows only changes with its symmetry; 'full' shows all."
     assert Analysis(scene, by_time, "point", 1.0).verdict() == words + unseen
