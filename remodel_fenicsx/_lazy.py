@@ -31,8 +31,8 @@ def resolved(maker: Callable[..., Any] | str) -> Callable[..., Any]:
 
 @functools.cache  # called in every iteration
 def _named(place: str) -> Callable[..., Any]:
-    found: Callable[..., Any] = pkgutil.resolve_name(place)
-    return found
+    maker: Callable[..., Any] = pkgutil.resolve_name(place)
+    return maker
 
 
 class Late:

@@ -309,6 +309,7 @@ COLUMNS_ON_REQUEST: dict[str, Column] = {
         *_PROFILE_COLUMNS,
     )
 }
+"""Columns that a scene may name in `output.columns`; scripts may add columns."""
 for old_name, new_name in (
     ("asleep_share", "inactive_fraction"),
     ("processor_seconds", "cpu_seconds"),
@@ -316,7 +317,6 @@ for old_name, new_name in (
     COLUMNS_ON_REQUEST[old_name] = replace(
         COLUMNS_ON_REQUEST[new_name], name=old_name, meaning=f"earlier name of `{new_name}`"
     )
-"""Columns that a scene may name in `output.columns`; scripts may add columns."""
 
 
 def columns_of(
