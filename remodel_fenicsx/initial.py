@@ -81,9 +81,9 @@ def initial_states(scene: Scene, domain: Domain, fibres: Fibres) -> list[State]:
     properties, local_axes = scene.properties(), scene.geometry.local_axes(domain, quadrature)
     own = {name: properties[name].cells for name in scene.regions}
     grows = scene.remodeling.turnover.grows
-    if grows or not scene.natural.is_trivial:
+    if grows or not scene.is_stress_free:
         values, closed = np.eye(3), None
-        if not scene.natural.is_trivial:
+        if not scene.is_stress_free:
             values, closed = natural_gradient(scene, quadrature, domain, local_axes, fibres)
         present, initial = (
             quadrature.function(f"{name}_gradient", (3, 3)) for name in ("natural", "initial")
@@ -128,7 +128,7 @@ def natural_gradient(
 ) -> tuple[Array, ClosedRing | None]:
     """Return G of the natural configuration (elements, points, 3, 3); the closed ring or None."""
     from remodel_fenicsx.body.wall import gradient, prestretch
-    from remodel_fenicsx.model.residual_stress import close_ring
+    from remodel_fenicsx.model.residual_stress import close_ring, fresh_stretches
 
     natural, shape = scene.natural, scene.geometry
     ring = None
@@ -172,6 +172,11 @@ def natural_gradient(
             raise SceneError(f"natural.opening_angle = {natural.opening_angle:g}: {rule}")
     else:
         stretches = prestretch(natural, local_axes, domain)
+        fresh = np.ones_like(stretches)
+        for name, properties in scene.properties().items():
+            chosen = domain.element_region == domain.regions[name] if name else slice(None)
+            fresh[chosen] = fresh_stretches(properties.tissue)
+        stretches *= fresh
     return gradient(stretches, local_axes.axes).reshape(*quadrature.shape, 3, 3), ring
 
 

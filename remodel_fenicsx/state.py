@@ -24,7 +24,7 @@ from remodel_fenicsx.fem.quadrature import Quadrature
 from remodel_fenicsx.kernels import PointKernels, point_kernels, with_kernels
 from remodel_fenicsx.model.axes import AXES, LocalAxes, cells_from_tensors, structure_tensors
 from remodel_fenicsx.model.cells import UnitCell
-from remodel_fenicsx.model.energy import MATRICES, TURNED_OVER, Tissue, mixture_matrix
+from remodel_fenicsx.model.energy import ELASTIN, MATRICES, TURNED_OVER, Tissue, mixture_matrix
 from remodel_fenicsx.schema.settings import Cells, MEASURED_CELLS, Properties
 
 if TYPE_CHECKING:
@@ -394,7 +394,7 @@ class State:
         for prepared in self.cells.prepared:
             if tissue is prepared.given or tissue is prepared.tissue:
                 return prepared
-        prepared = Parameters(tissue, self.cells.quadrature)
+        prepared = Parameters(tissue, self.cells)
         self.cells.prepared.append(prepared)
         return prepared
 
@@ -618,6 +618,9 @@ class FieldHistory:
 
 def tissue_at_points(tissue: Tissue, quadrature: Quadrature) -> Tissue:
     """Return a tissue with parameters as arrays over the points, (elements * points,)."""
+    axes = tissue.elastin_axes
+    if axes is not None:
+        tissue = replace(tissue, elastin_axes=quadrature.values(axes, (3, 3)).reshape(-1, 3, 3))
     return tissue.map(lambda name, value: assembly.point_values(value, quadrature).reshape(-1))
 
 
@@ -653,9 +656,13 @@ class Parameters:
         The tissue with its repulsion in C.
     """
 
-    def __init__(self, tissue: Tissue, quadrature: Quadrature):
-        self.given, self.quadrature = tissue, quadrature
-        mesh = quadrature.mesh
+    def __init__(self, tissue: Tissue, cells: UnitCells):
+        self.given, self.quadrature = tissue, cells.quadrature
+        quadrature, mesh = cells.quadrature, cells.quadrature.mesh
+        if tissue.elastin_axial is not None:
+            axes = quadrature.function("elastin_axes", (3, 3))
+            quadrature.values(axes, (3, 3))[:] = cells.local_axes.axes
+            tissue = replace(tissue, elastin_axes=axes)
         self.tissue = tissue.map(
             lambda name, value: (
                 value if name in TURNED_OVER else assembly.coefficient(mesh, name, value)
@@ -670,7 +677,7 @@ class Parameters:
         """Return the tissue with the largest value of each parameter in the body. Collective."""
 
         def largest_values() -> Tissue:
-            maxima = self.compiled.map(
+            maxima = replace(self.compiled, elastin_axes=None).map(
                 lambda name, value: self.quadrature.maximum(
                     assembly.point_values(value, self.quadrature)
                 )
@@ -733,6 +740,10 @@ def _tissues(properties: Mapping[str, Properties]) -> dict[str, Tissue]:
     tissues = {name: region.tissue for name, region in properties.items()}
     chain = next((tissue.chain for tissue in tissues.values() if tissue.chain is not None), None)
     matrices = list(dict.fromkeys(region.material.matrix for region in properties.values()))
+    if any(tissue.elastin_axial is not None for tissue in tissues.values()):
+        for name, tissue in tissues.items():
+            ones = {key: 1.0 for key in ELASTIN if getattr(tissue, key) is None}
+            tissues[name] = replace(tissue, **ones)  # type: ignore[arg-type]
     for name, tissue in tissues.items():
         if chain is not None and tissue.chain is None:
             length = CONTOUR_LENGTH_WITHOUT_CHAINS if chain.locks else tissue.contour_length

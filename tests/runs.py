@@ -12,7 +12,7 @@ import numpy as np
 from mpi4py import MPI
 
 from remodel_fenicsx import Recording, Scene, Simulation
-from remodel_fenicsx.body.tube import _opening_angle
+from remodel_fenicsx.body.tube import _of_rings
 from remodel_fenicsx.evolution.stepper import Step, Watcher
 from remodel_fenicsx.results.columns import Measurement
 from remodel_fenicsx.running import resume, run
@@ -69,7 +69,7 @@ def last_row(scene: Scene | Mapping[str, Any], domain: Any = None) -> dict[str, 
 def opening_angle(simulation: Simulation) -> float:
     """Of a cut of the present state of a tube; the column would cut in every row."""
     step: Any = SimpleNamespace(time=0.0)
-    return _opening_angle(Measurement(simulation.observer, step))
+    return _of_rings("cut", Measurement(simulation.observer, step))
 
 
 def columns_of(scene: Scene | Mapping[str, Any], domain: Any = None) -> dict[str, np.ndarray]:

@@ -250,9 +250,10 @@ def _of_the_end(name: str, m: Any) -> float:
     return float(getattr(m.end_force("inner"), name)(loads.get("pressure", 0.0)))
 
 
-def _opening_angle(m: Any) -> float:
-    """Compute the opening angle of the unloaded tube with its current cells. Collective."""
-    from remodel_fenicsx.model.residual_stress import Rings, cut, means_through
+def _of_rings(release: str, m: Any) -> float:
+    """Return `cut` or `unloaded_stretch` of the tube with its current cells. Collective."""
+    from remodel_fenicsx.model import residual_stress
+    from remodel_fenicsx.model.residual_stress import Rings, means_through
 
     state, stepper = m.state, m.observer.stepper
     cells, comm = state.cells, state.comm
@@ -284,12 +285,11 @@ def _opening_angle(m: Any) -> float:
     )
     rings = Rings(radii, volumes * density, changed * at_first(radii), squared)
     try:
-        return cut(
-            replace(tissue, **dict(zip(turned, turnover.T, strict=True))), rings, edges, closed
-        )
+        tissue = replace(tissue, **dict(zip(turned, turnover.T, strict=True)))
+        return float(getattr(residual_stress, release)(tissue, rings, edges, closed))
     except ArithmeticError as error:
         if comm.rank == 0:
-            log.warning("time %g: no opening_angle: %s", m.step.time, error)
+            log.warning("time %g: no equilibrium without loads: %s", m.step.time, error)
         return float("nan")
 
 
@@ -383,8 +383,15 @@ class Tube(RoundWall):
             "opening_angle",
             "degrees",
             "sector by which the unloaded tube would open after a cut along its length now",
-            _opening_angle,
+            partial(_of_rings, "cut"),
             by_case=False,
+            of_one_tissue=True,
+        ),
+        Column(
+            "axial_stretch_in_vivo",
+            "",
+            "length over that of the unloaded tube with its cells now: retraction after excision",
+            lambda m: (1 + _elongation(m)) / _of_rings("unloaded_stretch", m),
             of_one_tissue=True,
         ),
         Column(

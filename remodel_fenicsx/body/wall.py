@@ -214,6 +214,12 @@ def _stress(where: str, mean: AngleOf, component: int, m: Any) -> float:
     return mean(m, m.wall_stress[..., component])
 
 
+def _stress_of_part(part: str, component: int, m: Any) -> float:
+    collagen = m.collagen_wall_stress
+    stress = collagen if part == "collagen" else m.wall_stress - collagen
+    return float(m.quadrature.nanmean(stress[..., component], np.linalg.det(m.F)))
+
+
 def _fitted_to_face(face: str, m: Any) -> Array:
     """Return the stress around, along and across the wall at a face, (3,). Collective."""
     # The stress at superconvergent points is fitted by a polynomial of (R_face/R)^2. In a linear
@@ -273,6 +279,25 @@ class Walled(Shape):
             lambda m: m.quadrature.nanmean(m.radial_share),
             by_case=False,
         ),
+        *(
+            Column(
+                f"elastin_stretch_{name}",
+                "",
+                f"{name} stretch of the matrix with its prestretch, mean over the volume",
+                lambda m, i=i: m.quadrature.mean(m.elastin_stretches[..., i]),  # type: ignore[misc]
+            )
+            for i, name in enumerate(("circumferential", "axial"))
+        ),
+        *(
+            Column(
+                f"{name}_stress_{part}",
+                "stress",
+                f"Cauchy stress {STRESSES[name][0]} the wall in the {part}, mean over its volume",
+                partial(_stress_of_part, part, STRESSES[name][1]),
+            )
+            for name in ("hoop", "axial")
+            for part in ("matrix", "collagen")
+        ),
     )
     angle_layers = {
         "fibre_angle_inner": 0.0,
@@ -310,7 +335,7 @@ class RoundWall(Walled, WithRegions, Unloads):
         self, natural: Natural, regions: Regions, tissues: Mapping[str, Tissue]
     ) -> Any:
         """Return layers of one tissue and prestretch, `model.residual_stress.Layer`, outwards."""
-        from remodel_fenicsx.model.residual_stress import UNSTRETCHED, Layer
+        from remodel_fenicsx.model.residual_stress import UNSTRETCHED, Layer, fresh_stretches
 
         wall = self.wall(len(regions), regions)
         inner, outer = wall.radii[0], wall.radii[-1]
@@ -332,11 +357,12 @@ class RoundWall(Walled, WithRegions, Unloads):
                     else layer.region == region
                 )
             ]
+            tissue = tissues[region if region in tissues else ""]
             layers.append(
                 Layer(
                     (low, high),
-                    tissues[region if region in tissues else ""],
-                    (*of_layer, UNSTRETCHED)[0],
+                    tissue,
+                    (*of_layer, UNSTRETCHED)[0] * fresh_stretches(tissue),
                 )
             )
         return layers

@@ -7,6 +7,8 @@ Stresses, drivers, residual and tangent follow by differentiation. Per reference
     W_iso  = lambda/2 ln^2 J + mu/2 (tr C - 3) - mu ln J
     W_chn  = c psi(r),  r^2 = sum_I l_I^2 I_I,  I_I = n_I . C n_I = f_I . f_I,  f_I = F n_I
     W_rep  = -c/2 g(r0) sum_I l_I^2 ln I_I
+
+With a prestretch G_e of elastin W_iso takes F G_e (docs/tissue_that_lives.md, Elastin).
 """
 
 from __future__ import annotations
@@ -40,6 +42,10 @@ ufl = Late("ufl")
 Array = NDArray[np.float64]
 Term = Formula[UflOrArray]  # of F or J, lambda and mu
 TURNED_OVER = ("content", "natural_length")  # parameters that turnover changes at every point
+ELASTIN = ("elastin_circumferential", "elastin_axial")  # prestretch of the matrix
+AXES_ON_THE_RADIUS = np.eye(3)[[1, 2, 0]]
+"""Circumferential, axial and radial axes as rows, where x, y and z are the radial, circumferential
+and axial directions: in kinematics on one radius, and in `model.residual_stress`."""
 # Every tissue has these parameters.
 PARAMETERS = ("lame_lambda", "lame_mu", "network_modulus", "contour_length", "end_to_end_length")
 
@@ -348,6 +354,8 @@ class Stresses(NamedTuple):
         S = F^-1 P, UFL, (3, 3).
     cauchy
         sigma = P F^T / J, UFL, (3, 3).
+    collagen
+        The same three of the network alone; None in these.
 
     Examples
     --------
@@ -362,6 +370,19 @@ class Stresses(NamedTuple):
     first_piola_kirchhoff: UflOrArray
     second_piola_kirchhoff: UflOrArray
     cauchy: UflOrArray
+    collagen: Stresses | None = None
+
+    def over(self, volume_ratio: UflOrArray) -> Stresses:
+        """Divide all stresses by the volume ratio of growth.
+
+        Parameters
+        ----------
+        volume_ratio
+            J_g, UFL.
+        """
+        collagen = self.collagen and self.collagen.over(volume_ratio)
+        first, second, cauchy = (stress / volume_ratio for stress in self[:3])
+        return Stresses(first, second, cauchy, collagen)
 
     def plus(
         self, deformation_gradient: UflOrArray, second_piola_kirchhoff: UflOrArray
@@ -382,8 +403,9 @@ class Stresses(NamedTuple):
         """
         F, S = deformation_gradient, second_piola_kirchhoff
         P = ufl.dot(F, S)
-        first, second, cauchy = self
-        return Stresses(first + P, second + S, cauchy + ufl.dot(P, F.T) / ufl.det(F))
+        collagen = self.collagen and self.collagen.plus(F, S)
+        first, second, cauchy = self[:3]
+        return Stresses(first + P, second + S, cauchy + ufl.dot(P, F.T) / ufl.det(F), collagen)
 
 
 @with_old_names
@@ -413,6 +435,12 @@ class Tissue:
     content, natural_length
         Density m and natural length rho of the chains, relative to their initial values
         (`model.laws`): W_net = m c (w(r/rho) - g(r0) M / 2). None if they stay 1.
+    elastin_circumferential, elastin_axial
+        Prestretch of the matrix, whose radial stretch keeps the volume: det G_e = 1. None without
+        prestretch.
+    elastin_axes
+        Circumferential, axial and radial unit vectors as rows, (3, 3) or (..., 3, 3); None for
+        `AXES_ON_THE_RADIUS`.
 
     Examples
     --------
@@ -440,6 +468,9 @@ class Tissue:
     repulsion: Repulsion = REPULSIONS["axes"]
     content: UflOrArray = None
     natural_length: UflOrArray = None
+    elastin_circumferential: UflOrArray = None
+    elastin_axial: UflOrArray = None
+    elastin_axes: UflOrArray = field(default=None, compare=False)
 
     @property
     def locking_length(self) -> UflOrArray:
@@ -490,9 +521,9 @@ class Tissue:
 
     @property
     def parameters(self) -> dict[str, UflOrArray]:
-        """All parameters by name, with those of turnover and additional ones."""
-        turned_over = [name for name in TURNED_OVER if getattr(self, name) is not None]
-        values = {name: getattr(self, name) for name in (*PARAMETERS, *turned_over)}
+        """All parameters by name, with those of turnover, elastin, and additional ones."""
+        optional = [name for name in TURNED_OVER + ELASTIN if getattr(self, name) is not None]
+        values = {name: getattr(self, name) for name in (*PARAMETERS, *optional)}
         for additional in self._own_parameters.values():
             values |= additional
         return values
@@ -521,7 +552,8 @@ class Tissue:
             )
             for component, names in self._own_parameters.items()
         }
-        own = {name: values[name] for name in values if name in PARAMETERS + TURNED_OVER}
+        known = PARAMETERS + TURNED_OVER + ELASTIN
+        own = {name: values[name] for name in values if name in known}
         return replace(self, **own, **components)
 
     def is_round(self) -> bool:
@@ -532,6 +564,30 @@ class Tissue:
             self.matrix(F, self.lame_lambda, self.lame_mu) for F in (pulled, rotated)
         )
         return bool(np.isclose(energy, rotated_energy, rtol=1e-9))
+
+    def elastin_stretches(self) -> list[UflOrArray]:
+        """Return the circumferential, axial and radial prestretch of the matrix, det G_e = 1."""
+        around, along = self.elastin_circumferential, self.elastin_axial
+        return [around, along, 1 / (around * along)]
+
+    def matrix_gradient(self, deformation_gradient: UflOrArray) -> UflOrArray:
+        """Return F_m = F G_e, the deformation gradient of the matrix.
+
+        Parameters
+        ----------
+        deformation_gradient
+            F, UFL of shape (3, 3) or array (..., 3, 3).
+        """
+        F = deformation_gradient
+        if self.elastin_axial is None:
+            return F
+        axes = AXES_ON_THE_RADIUS if self.elastin_axes is None else self.elastin_axes
+        if is_array(F):
+            stretches = np.stack(np.broadcast_arrays(*self.elastin_stretches()), axis=-1)
+            return F @ np.einsum("...i,...ij,...ik->...jk", stretches, axes, axes)
+        axes = ufl.as_matrix(axes) if is_array(axes) else axes
+        directions = enumerate(self.elastin_stretches())
+        return ufl.dot(F, sum(s * ufl.outer(axes[i, :], axes[i, :]) for i, s in directions))
 
     def strain_energy(
         self, deformation_gradient: UflOrArray, cells: Sequence[UnitCell]
@@ -552,14 +608,16 @@ class Tissue:
             `Repulsion.derivatives`, which enter forms as values at the quadrature points
             (`solver.equilibrium.PointwiseRepulsion`).
         """
-        energy = self.matrix(deformation_gradient, self.lame_lambda, self.lame_mu)
+        F_m = self.matrix_gradient(deformation_gradient)
+        energy = self.matrix(F_m, self.lame_lambda, self.lame_mu)
         return self._with_network(energy, deformation_gradient, cells)
 
     def distortional_energy(
         self, deformation_gradient: UflOrArray, cells: Sequence[UnitCell]
     ) -> UflOrArray:
         """Return W without the volumetric part of the matrix; see `strain_energy`."""
-        energy = self._parts().distortional(deformation_gradient, self.lame_lambda, self.lame_mu)
+        F_m = self.matrix_gradient(deformation_gradient)
+        energy = self._parts().distortional(F_m, self.lame_lambda, self.lame_mu)
         return self._with_network(energy, deformation_gradient, cells)
 
     def volumetric_energy(self, jacobian: UflOrArray) -> UflOrArray:
@@ -614,7 +672,8 @@ class Tissue:
             One whole cell, or cells whose weights add up to one.
         """
         F = ufl.variable(deformation_gradient)
-        return _stresses(F, ufl.diff(self.strain_energy(F, cells), F))
+        stresses = _stresses(F, ufl.diff(self.strain_energy(F, cells), F))
+        return stresses._replace(collagen=self._collagen_stresses(F, cells))
 
     def stresses_of_parts(
         self, deformation_gradient: UflOrArray, cells: Sequence[UnitCell], jacobian: UflOrArray
@@ -622,9 +681,14 @@ class Tissue:
         """Return stresses with U at the given J: P = d(W - U)/dF + J U'(J) F^-T; UFL."""
         F, J = ufl.variable(deformation_gradient), ufl.variable(jacobian)
         pressure = J * ufl.diff(self.volumetric_energy(J), J)
-        return _stresses(
+        stresses = _stresses(
             F, ufl.diff(self.distortional_energy(F, cells), F) + pressure * ufl.inv(F).T
         )
+        return stresses._replace(collagen=self._collagen_stresses(F, cells))
+
+    def _collagen_stresses(self, F: UflOrArray, cells: Sequence[UnitCell]) -> Stresses:
+        energy = self._with_network(0.0 * ufl.tr(F), F, cells)
+        return _stresses(F, ufl.diff(energy, F))
 
     def energy_increment(
         self, deformation_gradient: UflOrArray, old: UnitCell, new: UnitCell

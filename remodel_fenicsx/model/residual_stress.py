@@ -116,7 +116,7 @@ class Layer(NamedTuple):
 
     radii: tuple[float, float]
     tissue: Tissue
-    prestretch: tuple[float, float, float] = UNSTRETCHED
+    prestretch: Sequence[float] = UNSTRETCHED
 
 
 class Loads(NamedTuple):
@@ -315,6 +315,24 @@ def principal_stresses(
     )
 
 
+def fresh_stretches(tissue: Tissue) -> Array:
+    """Return the principal stretches of G, (3,), that make fresh tissue stress-free.
+
+    With a prestretch of elastin, matrix and isotropic cells balance at these circumferential, axial
+    and radial stretches.
+    """
+    if tissue.elastin_axial is None:
+        return np.ones(3)
+
+    def stretches(values: Array) -> Array:
+        return np.exp(values)[..., None, None, :]
+
+    def residual(values: Array, stresses: Array) -> Array:
+        return stresses[..., 0, 0, :]
+
+    return np.exp(solve_newton([tissue], [None], stretches, residual, np.zeros(3)))
+
+
 def _energy(tissue: Tissue, stretches: Array, dimensions: Array | None) -> Array:
     """Return W (...) at stretches (..., 3) along the axes of the cells."""
     length = np.broadcast_to(
@@ -360,6 +378,20 @@ class Rings(NamedTuple):
 
 def cut(tissue: Tissue, rings: Rings, edges: Array, closed: ClosedRing | None = None) -> float:
     """Return the opening angle in degrees of rings after a cut; `edges` are radii of elements."""
+    return 360.0 * (1.0 - _released(tissue, rings, edges, closed)[1])
+
+
+def unloaded_stretch(
+    tissue: Tissue, rings: Rings, edges: Array, closed: ClosedRing | None = None
+) -> float:
+    """Return the axial stretch e of whole rings without loads; arguments as of `cut`."""
+    return _released(tissue, rings, edges, closed, opens=False)[0]
+
+
+def _released(
+    tissue: Tissue, rings: Rings, edges: Array, closed: ClosedRing | None, opens: bool = True
+) -> tuple[float, float]:
+    """Return e and k of rings without loads, which keep k = 1 unless they open."""
     # The volumes are those of the stress-free tissue. `closed` is the sector of the initial state,
     # a starting value.
     from scipy.interpolate import BSpline  # imported here, because few runs need it
@@ -404,6 +436,8 @@ def cut(tissue: Tissue, rings: Rings, edges: Array, closed: ClosedRing | None = 
             density.sum(axis=-1, keepdims=True)
             for density in (hoop, axial, hoop * across / np.ptp(edges))
         ]
+        if not opens:
+            integrals[2] = values[..., -1:] - 1.0
         return np.concatenate([integrals[0], nodes, *integrals[1:]], axis=-1)
 
     values = np.concatenate([[inner * k], np.zeros(functions.shape[1]), [axial, k / thinner]])
@@ -411,7 +445,7 @@ def cut(tissue: Tissue, rings: Rings, edges: Array, closed: ClosedRing | None = 
     solution = solve_newton(
         [tissue], dimensions, lambda values: opened(values)[-1][..., None, :, :], residual, values
     )
-    return float(360.0 * (1.0 - solution[-1]))
+    return float(solution[-2]), float(solution[-1])
 
 
 def means_through(

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from functools import cached_property
 from numbers import Real
 from typing import Any, NamedTuple, TypeVar
@@ -23,6 +24,7 @@ from remodel_fenicsx.fem import compat, jit
 from remodel_fenicsx.fem.assembly import integral, allreduce
 from remodel_fenicsx.fem.quadrature import Quadrature
 from remodel_fenicsx.model.drivers import DRIVERS
+from remodel_fenicsx.model.energy import Stresses
 from remodel_fenicsx.schema.tables import SceneError, format_value
 from remodel_fenicsx.solver.equilibrium import Equilibrium, PointStresses
 
@@ -177,20 +179,42 @@ class Measurement:
             # the pass needs the same tensor
             return stepper.remodeling.driving_tensor()[1].reshape(*self.quadrature.shape, 3, 3)
 
-        def compiled() -> tuple[PointStresses, jit.PointValues]:
-            stresses = PointStresses(self.state, stepper.tissue)
-            return stresses, jit.expression(stresses.ufl.cauchy, self.quadrature.points)
+        return self._cauchy_stress("cauchy stress", lambda stresses: stresses)
 
-        stresses, expression = self.cached("cauchy stress", compiled)
+    def _cauchy_stress(self, key: str, part: Callable[[Stresses], Any]) -> Array:
+        def compiled() -> tuple[PointStresses, jit.PointValues]:
+            stresses = PointStresses(self.state, self.observer.stepper.tissue)
+            return stresses, jit.expression(part(stresses.ufl).cauchy, self.quadrature.points)
+
+        stresses, expression = self.cached(key, compiled)
         stresses.refresh()
         return self.quadrature.evaluate(expression, (3, 3))
 
     @cached_property
     def wall_stress(self) -> Array:
         """Cauchy stress around, along and across the wall at all points, (elements, points, 3)."""
+        return self._in_the_wall(self.stress)
+
+    @cached_property
+    def collagen_wall_stress(self) -> Array:
+        """Part of `wall_stress` that the network bears, (elements, points, 3)."""
+        return self._in_the_wall(self._cauchy_stress("collagen", lambda s: s.collagen))
+
+    def _in_the_wall(self, stress: Array) -> Array:
         cells = self.state.cells
         axes = cells.local_axes.deformed(self.F)
-        return np.einsum("...ki,...ij,...kj->...k", axes, self.stress, axes)
+        return np.einsum("...ki,...ij,...kj->...k", axes, stress, axes)
+
+    @cached_property
+    def elastin_stretches(self) -> Array:
+        """Stretches F G G_e around, along and across the wall, (elements, points, 3)."""
+        tissue = self.equilibrium.parameters.at_points()
+        if tissue.elastin_axial is None:
+            tissue = replace(tissue, elastin_circumferential=1.0, elastin_axial=1.0)
+        cells, shape = self.state.cells, self.quadrature.shape
+        moved = np.einsum("...ij,...kj->...ki", self.state.elastic(self.F), cells.local_axes.axes)
+        prestretch = [np.broadcast_to(s, shape[0] * shape[1]) for s in tissue.elastin_stretches()]
+        return np.linalg.norm(moved, axis=-1) * np.stack(prestretch, axis=-1).reshape(*shape, 3)
 
     @cached_property
     def fibre_angle(self) -> Array:

@@ -219,10 +219,13 @@ def natural_state(scene: Scene) -> Faults:
     """Check that shape, formulation and cells allow residual stress."""
     natural, shape = scene.natural, scene.geometry
     able, none = Walled, "none"
-    if natural.is_trivial or natural.fibres:
+    if scene.is_stress_free or natural.fibres:
         return
-    value: float
+    value: object
     key, value = "natural.layers", len(natural.layers)
+    if natural.is_trivial:
+        key, value = "material.elastin.prestretch", scene.material.elastin.prestretch
+        none = "[1.0, 1.0]"
     if natural.opening_angle:
         key, value = "natural.opening_angle", natural.opening_angle
         able, none = RoundWall, "0"

@@ -159,7 +159,7 @@ def borne(tissue: Tissue, is_loaded: bool) -> float:
     # The stretch is the square of the circumferential one.
     chain, modulus = tissue.chain, tissue.lame_mu
     stretch = math.inf
-    if tissue.matrix is not neo_hookean:
+    if tissue.matrix is not neo_hookean or tissue.elastin_axial is not None:
         return math.inf
     if chain is not None:
         length, start = NEAR_LOCKING * tissue.contour_length, tissue.end_to_end_length
@@ -396,12 +396,18 @@ class Scene(Table):
             self.mesh.element, self.mesh.degree
         )
 
+    @property
+    def is_stress_free(self) -> bool:
+        """Whether G = 1: no residual stress, and no prestretch of elastin."""
+        properties = self.properties().values()
+        return self.natural.is_trivial and not any(one.material.has_elastin for one in properties)
+
     def displacement_reason(self) -> str:
         """Return why "auto" cannot use the locking-free formulation, or an empty string."""
         if COUPLINGS[self.remodeling.coupling].solves_cells:
             return f"remodeling.coupling = {self.remodeling.coupling!r}"
-        if not self.natural.is_trivial:
-            return "[natural]"
+        if not self.is_stress_free:
+            return "[natural]" if not self.natural.is_trivial else "material.elastin"
         if self.remodeling.turnover.grows:
             return "remodeling.turnover.volume above 0"
         if not self.material.has_volumetric_split:
@@ -537,7 +543,7 @@ class Scene(Table):
     @property
     def lacking_fields(self) -> dict[str, str]:
         """Fields that the body does not have, each with the reason."""
-        turnover, same = self.remodeling.turnover, self.natural.is_trivial
+        turnover, same = self.remodeling.turnover, self.is_stress_free
         stress_free = (
             "the mesh is stress-free ([natural]): 'fibre_angle' is the angle in the unloaded body"
         )

@@ -42,7 +42,7 @@ from remodel_fenicsx.fem.solver_methods import (
 from remodel_fenicsx.model.axes import AXES, GROWTH, NATURAL_GRADIENT
 from remodel_fenicsx.model.chains import BOLTZMANN_CONSTANT, CHAINS
 from remodel_fenicsx.model.drivers import DRIVERS, FRAMES
-from remodel_fenicsx.model.energy import MATRICES, Matrix, REPULSIONS, TURNED_OVER, Tissue
+from remodel_fenicsx.model.energy import ELASTIN, MATRICES, Matrix, REPULSIONS, TURNED_OVER, Tissue
 from remodel_fenicsx.model.laws import LAWS, MEANS_OF_CASES, TURNOVER_RATES, TurnoverRule
 from remodel_fenicsx.model.spectral import PAIRINGS
 from remodel_fenicsx.schema.tables import (
@@ -193,6 +193,20 @@ class Supports(Table):
 # ---------------------------------------------------------------- tissue and cells
 
 
+_Stretch = Annotated[float, Field(gt=0)]
+
+
+class Elastin(Table):
+    """Prestretch of the matrix, which stands for elastin (docs/tissue_that_lives.md, Elastin)."""
+
+    prestretch: Annotated[tuple[_Stretch, _Stretch], IN_A_LIST] = Field(
+        default=(1.0, 1.0), json_schema_extra={"allowed": "two numbers greater than 0"}
+    )
+    """Circumferential and axial stretch of elastin beyond that of collagen deposited at the start;
+    its radial stretch keeps the volume. Fresh tissue stays stress-free. In the body's local
+    axes."""
+
+
 @with_old_names
 class Material(Table):
     """Tissue: an isotropic matrix (Lame constants) with a network of collagen chains.
@@ -255,6 +269,7 @@ class Material(Table):
     stress_unit: Annotated[str, OneOf(STRESS_UNITS)] = "Pa"
     """Unit of every stress of the scene. Forces are in this unit times the unit of length
     squared."""
+    elastin: Elastin = Elastin()
 
     @property
     def has_volumetric_split(self) -> bool:
@@ -289,7 +304,15 @@ class Material(Table):
             self._part(CHAINS[self.chain]) if self.chain_density > 0 else None,
             self._part(MATRICES[self.matrix]),
             self._part(REPULSIONS[self.repulsion]),
+            **(
+                dict(zip(ELASTIN, self.elastin.prestretch, strict=True)) if self.has_elastin else {}
+            ),
         )
+
+    @property
+    def has_elastin(self) -> bool:
+        """Whether the matrix has a prestretch."""
+        return self.elastin.prestretch != (1.0, 1.0)
 
     def _part(self, part: Any) -> Any:
         """Return a part with the values of its own parameters."""
@@ -931,6 +954,7 @@ _SomeMaterial: Any = _for_regions(
     "locking_stretch",
     "temperature",
     "matrix",
+    "elastin",
 )
 _SomeCells: Any = _for_regions(
     Cells, "cells", "initial", "fibres", "fibres_sha256", "aligned_axis", "end_to_end_length"

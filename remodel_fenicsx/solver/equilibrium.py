@@ -128,7 +128,7 @@ class PointStresses:
         # Amounts refer to the volume at the start, stresses to the present volume.
         if kinematics.grows:
             assert isinstance(kinematics, NaturalConfiguration)
-            self.ufl = Stresses(*(stress / kinematics.volume_ratio() for stress in self.ufl))
+            self.ufl = self.ufl.over(kinematics.volume_ratio())
 
     def refresh(self) -> None:
         """Update what the expressions need in addition to F from the present unknowns and cells."""
