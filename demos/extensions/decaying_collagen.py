@@ -55,5 +55,13 @@ class DecayingContent(Remodels):
         """Take a part of the loss of the step."""
         self.content.x.array[:] = self.last + fraction * (self.next - self.last)
 
+    def left(self, time, residual):
+        """Return the relative loss up to a time."""
+        return 1.0 - math.exp(-self.fastest * (time - self.state.time))
+
+    def without_rest(self, waiting):
+        """Return why the loss reaches no steady state."""
+        return "collagen is lost at a constant rate: set time.end to a late time to follow the loss"
+
 
 REMODELS["decay"] = RemodelsKind(Decay, DecayingContent)

@@ -174,7 +174,9 @@ class Homeostasis:
             # A step larger than 1/kappa counts as 1/kappa.
             waiting += min(1.0, self.stepper.slowest * (state.time - start))
             start = state.time
-            is_over = self._has_converged(change, waiting)
+            is_over = change <= STEADY_TOLERANCE
+            if not is_over and self._has_no_rest(change, waiting):
+                return
             if (is_over or change <= try_below) and (self._add_tail(time, loads, work) or is_over):
                 return
             work.residual, try_below = residual, min(try_below, AGAIN * change)
@@ -187,16 +189,13 @@ class Homeostasis:
     def _left(self, residual: float) -> float:
         """Return the largest relative change in a time of 1/kappa."""
         soon = self.state.time + 1 / self.stepper.slowest
-        return max(process.left(soon, residual) for process in self.remodels)
+        return max(process.left(soon, residual) for process in self.stepper.remodels)
 
-    def _has_converged(self, change: float, waiting: float) -> bool:
-        """Return whether the path ends, because of equilibrium or because there is none."""
-        if change <= STEADY_TOLERANCE:
-            return True
-        if without := [
-            text for process in self.remodels if (text := process.without_rest(waiting))
-        ]:
-            self._log(logging.WARNING, without[0])
+    def _has_no_rest(self, change: float, waiting: float) -> bool:
+        """Return whether the path ends without a steady state, and warn."""
+        reasons = [process.without_rest(waiting) for process in self.stepper.remodels]
+        if reason := next(filter(None, reasons), ""):
+            self._log(logging.WARNING, reason)
             return True
         if waiting > MAX_HOLD:
             text = (

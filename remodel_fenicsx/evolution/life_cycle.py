@@ -32,7 +32,8 @@ class Remodels:
     name
         Prefix of names in the state.
     components
-        Number of components at a point; 0 without values.
+        Number of components at a point; 0 without values, for which neither a time discretisation
+        error is estimated nor the tail of the steady state extrapolated.
     changes
         Whether the values change in time.
     slowest, fastest
@@ -113,7 +114,7 @@ class Remodels:
 
     # ------------------------------------------------------------ steady state
     def left(self, time: float, residual: float) -> float:
-        """Return the largest relative change up to a time."""
+        """Return the largest relative change up to a time. Every process needs it."""
         return 0.0
 
     def to_the_limit(self, time: float, duration: float, residual: float) -> Array:
@@ -131,7 +132,7 @@ class Remodels:
         """Reset the monitors for a new path to the steady state."""
 
     def without_rest(self, waiting: float) -> str:
-        """Return why a time under constant loads reaches no steady state, or an empty string."""
+        """Return why there is no steady state after a time under constant loads, or nothing."""
         return ""
 
     def rested(self, time: float) -> None:

@@ -140,7 +140,7 @@ def test_protocols_are_read_as_they_are_published(tmp_path: Path) -> None:
     np.testing.assert_allclose(back["elongation_x"], [0.05, 0.1], atol=1e-9)
     np.testing.assert_allclose(back["elongation_y"], [0.02, 0.04], atol=1e-9)
     (tmp_path / "data.toml").write_text(text.format("driven", sd.replace("force_y", "shear")))
-    with pytest.raises(SceneError, match=r"measured\[0\].drive = 'shear': allowed are"):
+    with pytest.raises(SceneError, match=r"measured\[0\].drive = 'shear': must be columns"):
         read_measurements(tmp_path / "data.toml", scene)
     (tmp_path / "data.toml").write_text(
         text.format("driven", "sd = { force_x = 1.0, force_y = 1.0 }")

@@ -59,10 +59,10 @@ import os, signal, sys
 from remodel_fenicsx import cli
 from remodel_fenicsx.evolution.coupling import Staggered
 from remodel_fenicsx.solver.continuation import CellHomotopy
-from remodel_fenicsx.system.interrupts import stopping_at_once
+from remodel_fenicsx.system.interrupts import raise_on_signal
 whole = Staggered._solve
 def compiled(blend):
-    with stopping_at_once():
+    with raise_on_signal():
         os.kill(os.getpid(), signal.SIGTERM)
 def in_parts(coupling, step, time, old_loads, loads, work, again):
     if coupling.state.number < 3:
