@@ -260,8 +260,10 @@ def reset_simulation(simulation: Simulation, start: Snapshot, scene: Scene) -> b
     # Adaptive time stepping, growth and the stability check hold numbers of the scene.
     chosen = not isinstance(simulation.way, FixedSteps)
     watched = chosen or kinematics.grows or scene.solver.unstable == "stop"
-    if watched or any(
-        varies[name] and not isinstance(parameters[name], Function) for name in varies
+    if (
+        watched
+        or parameters.keys() != varies.keys()
+        or any(varies[name] and not isinstance(parameters[name], Function) for name in varies)
     ):
         return False
     for name, value in tissue.parameters.items():

@@ -113,10 +113,13 @@ def parse_override(text: str) -> tuple[str, object]:
 
 
 def set_nested(values: dict[str, object], key: str, value: object) -> None:
-    """Set a value at a dotted key and create the tables that contain it."""
+    """Set a value at a dotted key, of a list at its number, and create the tables around it."""
     *parents, name = (part.strip() for part in key.split("."))
     for depth, parent in enumerate(parents):
         table = values.setdefault(parent, {})
+        if isinstance(table, (list, tuple)) and name in map(str, range(len(table))):
+            values[parent] = [*table[: int(name)], value, *table[int(name) + 1 :]]
+            return
         if not isinstance(table, dict):
             place = ".".join(parents[: depth + 1])
             raise SceneError(

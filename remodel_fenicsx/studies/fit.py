@@ -390,7 +390,7 @@ def data_warnings(
 
 # ---------------------------------------------------------------- model values at measurements
 # Keys whose numbers an existing simulation can take (`reset_simulation`).
-TISSUE = r"(regions\.\w+\.)?(material\.\w+|remodeling\.(kappa|half_life))"
+TISSUE = r"(regions\.\w+\.)?(material\.[\w.]+|remodeling\.(kappa|half_life))"
 OTHERS = r"loads\.\w+\.value|natural\.\w+"
 CAN_BE_SET = rf"scale\..*|{TISSUE}|{OTHERS}"
 # With these tolerances only rounding errors are amplified by difference quotients of runs.

@@ -258,7 +258,11 @@ def _changed(scene: Scene, point: Point) -> Scene:
     for key, value in point.items():
         there: Any = changed
         for part in key.split("."):
-            there = there[part] if isinstance(there, Mapping) else getattr(there, part)
+            there = (
+                there[int(part)]
+                if isinstance(there, tuple)
+                else (there[part] if isinstance(there, Mapping) else getattr(there, part))
+            )
         if there != value:
             raise SceneError(f"sweep {key}: this key does not take a number")
     return changed
