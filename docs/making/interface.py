@@ -21,6 +21,7 @@ from mpi4py import MPI
 
 import remodel_fenicsx
 from remodel_fenicsx import cli, extend, parts
+from remodel_fenicsx._renamed import OldAttribute
 from docs.making.pages import DOCS, markdown
 from remodel_fenicsx.body.shape import (
     COLUMNS_ON_REQUEST,
@@ -117,7 +118,11 @@ def described(kind: type) -> Iterator[str]:
     members: dict[str, str] = {}
     for owner in reversed(own):
         members |= {name: name for name in _documented(owner)}
-        members |= {name: name + _parameters(member) for name, member in vars(owner).items()}
+        members |= {
+            name: name + _parameters(member)
+            for name, member in vars(owner).items()
+            if not isinstance(member, OldAttribute)
+        }
     made = ""
     if issubclass(kind, Table):
         made = "(**keys)"
