@@ -444,7 +444,7 @@ def _export(options: argparse.Namespace) -> None:
 @command(
     "new kuhl-holzapfel-2007 --shape tube > mine.toml",
     """
-    preset PRESET  The model: kuhl-holzapfel-2007, consistent or sun-2002.
+    preset PRESET  The model: kuhl-holzapfel-2007, consistent, sun-2002 or carotid.
     --shape SHAPE = tube  The body: cube, tendon, sheet or tube (default: %(default)s).
     """,
 )

@@ -42,19 +42,22 @@ def _section(key: str, variant: str, table: type[BaseModel], told: dict[str, str
         name: field for name, field in table.model_fields.items() if choices(field) != [variant]
     }  # in the title
     texts = {name: text for name in fields if (text := description(table, name))}
+    elsewhere: dict[str, list[str]] = {}
+    for name, text in texts.items():
+        if (as_key := re.match(r"As `([\w.]+)\.\w+`, for this region", text)) is not None:
+            elsewhere.setdefault(f"as in `[{as_key[1]}]`, else those of the whole body", []).append(
+                f"`{name}`"
+            )
+    in_regions = {name for names in elsewhere.values() for name in names}
     rows = {
         name: " | ".join(
             [f"| `{name}`", _default(fields[name]), _allowed_in_words(fields[name]), _cell(text)]
         )
         for name, text in texts.items()
+        if f"`{name}`" not in in_regions
     }
-    elsewhere: dict[str, list[str]] = {}
     for name, row in rows.items():
-        if (as_key := re.match(r"As `([\w.]+)\.\w+`, for this region", texts[name])) is not None:
-            elsewhere.setdefault(f"as in `[{as_key[1]}]`, else those of the whole body", []).append(
-                f"`{name}`"
-            )
-        elif variant and row in told:
+        if variant and row in told:
             elsewhere.setdefault(f"as of shape `{told[row]!r}`", []).append(f"`{name}`")
     told |= {row: variant for row in rows.values() if row not in told}
     left_out = {name for names in elsewhere.values() for name in names}

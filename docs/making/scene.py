@@ -87,16 +87,17 @@ def flat(values: Mapping[str, Any], before: str = "") -> Iterator[tuple[str, str
 
 def _presets() -> Iterator[str]:
     """A section for each preset: its note, and its keys by shape; after the first only what is other than there."""
-    first = _by_key(next(iter(PRESETS.values())))
+    printed = next(iter(PRESETS.values()))
     for number, (name, shapes) in enumerate(PRESETS.items()):
         yield from (f"## Preset `{name}`", "", *paragraphs(PRESET_NOTES[name]), "")
         rows = _by_key(shapes)
         if number:
             yield from (f"All else is as in the preset `{next(iter(PRESETS))}`.", "")
+            first = _by_key({shape: printed[shape] for shape in shapes})
             rows = {row: having for row, having in rows.items() if first.get(row) != having}
-        groups: dict[str, list[str]] = {"all": []}
+        groups: dict[str, list[str]] = {"all": []} if len(shapes) > 1 else {}
         for (key, value), having in rows.items():
-            groups.setdefault("all" if having == list(shapes) else ", ".join(having), []).append(
+            groups.setdefault("all" if having == list(printed) else ", ".join(having), []).append(
                 f"{key} = {value}"
             )
         texts = ("\n".join([f"# {of}", *keys]) for of, keys in groups.items())

@@ -29,6 +29,7 @@ PRESETS: dict[str, dict[str, dict[str, object]]] = {
     name: {
         shape: merge_nested(merge_nested(_DATA["method"], body), preset["changes"])
         for shape, body in _DATA["bodies"].items()
+        if shape in preset.get("shapes", _DATA["bodies"])
     }
     for name, preset in _DATA["presets"].items()
 }

@@ -897,7 +897,8 @@ def preset_scene(preset: str, shape: str) -> Scene:
     Parameters
     ----------
     preset
-        Name of the preset: "kuhl-holzapfel-2007" (the paper), "consistent" or "sun-2002".
+        Name of the preset: "kuhl-holzapfel-2007" (the paper), "consistent", "sun-2002"
+        or "carotid" (a tube alone).
     shape
         "cube", "tendon" or "tube".
 
