@@ -565,10 +565,11 @@ class Tissue:
         )
         return bool(np.isclose(energy, rotated_energy, rtol=1e-9))
 
+    @property
     def elastin_stretches(self) -> list[UflOrArray]:
-        """Return the circumferential, axial and radial prestretch of the matrix, det G_e = 1."""
+        """Circumferential, axial and radial prestretch of the matrix, det G_e = 1."""
         around, along = self.elastin_circumferential, self.elastin_axial
-        return [around, along, 1 / (around * along)]
+        return [1.0, 1.0, 1.0] if along is None else [around, along, 1 / (around * along)]
 
     def matrix_gradient(self, deformation_gradient: UflOrArray) -> UflOrArray:
         """Return F_m = F G_e, the deformation gradient of the matrix.
@@ -583,10 +584,9 @@ class Tissue:
             return F
         axes = AXES_ON_THE_RADIUS if self.elastin_axes is None else self.elastin_axes
         if is_array(F):
-            stretches = np.stack(np.broadcast_arrays(*self.elastin_stretches()), axis=-1)
+            stretches = np.stack(np.broadcast_arrays(*self.elastin_stretches), axis=-1)
             return F @ np.einsum("...i,...ij,...ik->...jk", stretches, axes, axes)
-        axes = ufl.as_matrix(axes) if is_array(axes) else axes
-        directions = enumerate(self.elastin_stretches())
+        directions = enumerate(self.elastin_stretches)
         return ufl.dot(F, sum(s * ufl.outer(axes[i, :], axes[i, :]) for i, s in directions))
 
     def strain_energy(

@@ -323,14 +323,14 @@ def fresh_stretches(tissue: Tissue) -> Array:
     """
     if tissue.elastin_axial is None:
         return np.ones(3)
-
-    def stretches(values: Array) -> Array:
-        return np.exp(values)[..., None, None, :]
-
-    def residual(values: Array, stresses: Array) -> Array:
-        return stresses[..., 0, 0, :]
-
-    return np.exp(solve_newton([tissue], [None], stretches, residual, np.zeros(3)))
+    logarithms = solve_newton(
+        [tissue],
+        [None],
+        lambda values: np.exp(values)[..., None, None, :],
+        lambda values, stresses: stresses[..., 0, 0, :],
+        np.zeros(3),
+    )
+    return np.exp(logarithms)
 
 
 def _energy(tissue: Tissue, stretches: Array, dimensions: Array | None) -> Array:

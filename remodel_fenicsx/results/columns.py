@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import replace
 from functools import cached_property
 from numbers import Real
 from typing import Any, NamedTuple, TypeVar
@@ -209,11 +208,9 @@ class Measurement:
     def elastin_stretches(self) -> Array:
         """Stretches F G G_e around, along and across the wall, (elements, points, 3)."""
         tissue = self.equilibrium.parameters.at_points()
-        if tissue.elastin_axial is None:
-            tissue = replace(tissue, elastin_circumferential=1.0, elastin_axial=1.0)
         cells, shape = self.state.cells, self.quadrature.shape
         moved = np.einsum("...ij,...kj->...ki", self.state.elastic(self.F), cells.local_axes.axes)
-        prestretch = [np.broadcast_to(s, shape[0] * shape[1]) for s in tissue.elastin_stretches()]
+        prestretch = [np.broadcast_to(s, shape[0] * shape[1]) for s in tissue.elastin_stretches]
         return np.linalg.norm(moved, axis=-1) * np.stack(prestretch, axis=-1).reshape(*shape, 3)
 
     @cached_property

@@ -521,8 +521,8 @@ def allowed(field: FieldInfo) -> str:
         )
     if isinstance(field.json_schema_extra, dict):
         return f"must be {field.json_schema_extra['allowed']}"
-    if is_table(field.annotation) or get_origin(field.annotation) is dict:
-        fields: dict[str, FieldInfo] = getattr(field.annotation, "model_fields", {})
+    if is_table(kind := _kind(field)) or get_origin(kind) is dict:
+        fields: dict[str, FieldInfo] = getattr(kind, "model_fields", {})
         required = [name for name, inner in fields.items() if inner.is_required()]
         return "must be a table" + (f" with {', '.join(required)}" if required else "")
     nouns: dict[object, str] = {

@@ -133,6 +133,11 @@ class LaggedFactorisation:
             if self._factorised(kind, matrix):
                 break
 
+    @property
+    def is_cholesky(self) -> bool:
+        """Whether the matrix of the last factorisation is known to be positive definite."""
+        return self._kind == DEFINITE
+
     def is_definite(self, matrix: Mat) -> bool:
         """Return whether CHOLMOD factorises a symmetric matrix, which is then positive definite."""
         taken = self._factorised(DEFINITE, matrix)
@@ -177,6 +182,8 @@ class LaggedFactorisation:
 
 class GatheredFactor:
     """Lagged factorisation on several ranks: the first one has the whole tangent. Collective."""
+
+    is_cholesky = False  # unknown on ranks without the factorisation
 
     def __init__(self, comm: Comm):
         self.comm, self.first = comm, LaggedFactorisation()
@@ -488,6 +495,8 @@ class Lagged(FullNewton):
     def factorisation(self) -> PC | None:
         if not self._own:
             return super().factorisation()
+        if self.factor.is_cholesky:  # no direction of it has a negative curvature
+            return None
         return self.snes.getKSP().getPC() if self.tangents else None
 
     def close(self) -> None:

@@ -114,12 +114,10 @@ class OverCorrection(WarnsOnce):
         quadrature, parameters = self.quadrature, self.stepper.remodeling.parameters
         vector, r0 = self.state.unknown.x, parameters.largest().end_to_end_length
         scale = np.sqrt(quadrature.owned(quadrature.volumes) / quadrature.volume)[..., None] / r0**2
-        of_cells = (cells[:, : len(scale)] * scale).reshape(len(cells), -1)
-        of_body = np.array([vector.array, *self._body.values])[
-            :, : self.state.number_of_owned_unknowns
-        ]
-        of_body /= dolfinx.la.norm(vector) or 1.0
-        cells_swing, body_swing = self._swing(times, of_cells), self._swing(times, of_body)
+        bodies = np.array([vector.array, *self._body.values])
+        of_body = bodies[:, : self.state.number_of_owned_unknowns]
+        cells_swing = self._swing(times, cells[:, : len(scale)], scale)
+        body_swing = self._swing(times, of_body, np.array(1 / (dolfinx.la.norm(vector) or 1.0)))
         self.swings = {"growing": cells_swing, "sustained": body_swing}
         tells, overshoots = self._is_pass_oscillation(step, cells, times), False
         for (name, swing), (factor, passes) in zip(
@@ -142,9 +140,11 @@ class OverCorrection(WarnsOnce):
                 "(docs/theory.md, Stability of the pass)",
             )
 
-    def _swing(self, times: Array, values: Array) -> Oscillation:
-        """Return the oscillation of this rank's values (passes, n), in their norm. Collective."""
-        changes = np.array([_difference(times, values), _difference(times[1:], values[1:])])
+    def _swing(self, times: Array, values: Array, weight: Array) -> Oscillation:
+        """Return the oscillation of this rank's values (passes, ...), weighted. Collective."""
+        changes = np.array(
+            [(weight * _difference(times[age:], values[age:])).ravel() for age in (0, 1)]
+        )
         products = allreduce(self.state.comm, changes @ changes.T, MPI.SUM)
         return Oscillation(
             np.sqrt(products[0, 0]) / GAIN, products[0, 1] / (products[1, 1] or np.inf)
