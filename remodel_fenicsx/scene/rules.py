@@ -224,8 +224,10 @@ def natural_state(scene: Scene) -> Faults:
     value: object
     key, value = "natural.layers", len(natural.layers)
     if natural.is_trivial:
-        key, value = "material.elastin.prestretch", scene.material.elastin.prestretch
-        none = "[1.0, 1.0]"
+        own = {name: one.material for name, one in scene.properties().items()}
+        name = next(name for name in own if own[name].has_elastin)
+        key, none = f"{in_region(name)}material.elastin.prestretch", "[1.0, 1.0]"
+        value = own[name].elastin.prestretch
     if natural.opening_angle:
         key, value = "natural.opening_angle", natural.opening_angle
         able, none = RoundWall, "0"
