@@ -223,11 +223,11 @@ def natural_state(scene: Scene) -> Faults:
         return
     value: object
     key, value = "natural.layers", len(natural.layers)
-    if natural.is_trivial:
-        own = {name: one.material for name, one in scene.properties().items()}
-        name = next(name for name in own if own[name].has_elastin)
-        key, none = f"{in_region(name)}material.elastin.prestretch", "[1.0, 1.0]"
-        value = own[name].elastin.prestretch
+    for name, properties in scene.properties().items():
+        if properties.material.has_elastin:
+            key, none = f"{in_region(name)}material.elastin.prestretch", "[1.0, 1.0]"
+            value = properties.material.elastin.prestretch
+            break
     if natural.opening_angle:
         key, value = "natural.opening_angle", natural.opening_angle
         able, none = RoundWall, "0"
@@ -237,7 +237,8 @@ def natural_state(scene: Scene) -> Faults:
     ]
     if isinstance(shape, RoundWall):
         needs.append(("cells.axes", scene.cells.axes == "cylindrical", "'cylindrical'"))
-        for name, properties in scene.properties().items():
+    for name, properties in scene.properties().items():
+        if isinstance(shape, RoundWall) or properties.material.has_elastin:
             needs.append(
                 (
                     f"{in_region(name)}cells.initial",

@@ -21,9 +21,10 @@ from remodel_fenicsx.results.export import export
 from remodel_fenicsx.running import run
 from remodel_fenicsx.scene import scene_from_dict
 from tests.conftest import Cases, slowly
-from tests.mesh_files import write_tube
+from tests.mesh_files import TUBE, write_tube
 from tests.reference.elastin import ElasticWall, fresh, shot, stiffness
 from tests.reference.radial import RadialMaterial
+from tests.results.test_export_again import again, grown, scene as growing
 from tests.runs import SELF, goes_on, last_row, opening_angle, rows_of, simulated, taylor_orders
 from tests.values import ANGLES, isotropic, ramped
 
@@ -202,18 +203,22 @@ def test_a_whole_tube_is_the_one_on_a_radius() -> None:
         assert whole[name] == pytest.approx(radial[name], rel=1e-4)
 
 
-def own(file: Path, **tables: Any) -> Scene:
-    """The same tube from a file."""
-    body = {"shape": "mesh", "file": str(file)}
+def own_values(file: Path, **tables: Any) -> dict[str, Any]:
+    """A tube from a file."""
     values = {
-        "geometry": body,
+        "geometry": {"shape": "mesh", "file": str(file)},
         "cells": {"initial": "isotropic"},
         "material": {"repulsion": "log", "elastin": {"prestretch": [1.2, 1.5]}},
         "output": {"fields": False, "report": False, "columns": ["lumen_volume", *ALONG]},
         "solver": {"method": "direct"},
         "remodeling": {"law": "none"},
     }
-    return scene_from_dict(values | SHORT | tables)
+    return values | SHORT | tables
+
+
+def own(file: Path, **tables: Any) -> Scene:
+    """The scene of `own_values`."""
+    return scene_from_dict(own_values(file, **tables))
 
 
 def thin(places: np.ndarray) -> np.ndarray:
@@ -445,6 +450,7 @@ def test_what_has_no_elastin_says_so_in_one_line() -> None:
         (lambda: passive([], (1.2, -1.0)), f"{key}[1] = -1.0: must be two numbers greater than 0"),
         (lambda: passive([], (1.2,)), f"{key}[1]: missing; must be two numbers greater than 0"),
         (lambda: passive([], cells=random), f"{key} = [1.2, 1.5]: {isotropic_only}"),
+        (lambda: own(TUBE, cells=random), f"{key} = [1.2, 1.5]: {isotropic_only}"),
         (
             lambda: passive([], (1.0, 1.0), cells=random, regions=regions),
             f"regions.media.{key} = [1.2, 1.5]: must be [1.0, 1.0] unless regions.media.cells",
@@ -463,3 +469,36 @@ def test_a_run_goes_on(tmp_path: Path) -> None:
     found = goes_on(scene, tmp_path, 12.0, 24.0)
     assert found.history["growth"][-1] != pytest.approx(1.0, abs=1e-2)
     assert "prestretch = [0.92, 1.36]" in (found.path / "scene.toml").read_text()
+
+
+KEPT = ("lumen_volume", "fibre_angle_inner", "content", "growth", "elastin_stretch_axial")
+
+
+def test_what_export_writes_begins_the_same_run(tmp_path: Path) -> None:
+    """With the natural state that made fresh tissue stress-free; of tetrahedra, one F each."""
+    mesh = write_tube(tmp_path / "tube.msh", "tetrahedron")
+    tables: Any = {
+        "natural": {},
+        "material": {"repulsion": "log", "elastin": {"prestretch": [0.92, 1.36]}},
+        "output": {"columns": [*KEPT], "report": False},
+        "remodeling": grown(),
+    }
+    started = run(growing(mesh, 3.0, **tables), tmp_path / "run", SELF)
+    file = export(started, "vtu", tmp_path / "first.vtu", 2.0)
+    second = run(
+        again(mesh, file, 1.0, **tables | {"natural": {"fibres": True}}), tmp_path / "second", SELF
+    )
+    original, read = (Recording(folder).history for folder in (started, second))
+    assert abs(original["growth"][2] - 1.0) > 1e-3
+    for name in KEPT:
+        np.testing.assert_allclose(read[name][1], original[name][3], rtol=2e-3, err_msg=name)
+
+
+ON_ONE_AND_TWO_RANKS = [{"scene": own_values(TUBE)}]
+
+
+def test_two_ranks_find_the_same(cases: Cases) -> None:
+    """Places and columns."""
+    (one,), (two,) = (cases(ON_ONE_AND_TWO_RANKS, ranks) for ranks in (1, 2))
+    for name in ("u", "lumen_volume", *ALONG):
+        np.testing.assert_allclose(two[name], one[name], rtol=1e-7, atol=1e-8, err_msg=name)
