@@ -1,4 +1,4 @@
-"""A tube whose matrix is stretched further than its collagen: at a point, by shooting, and as it turns over.
+"""A tube whose matrix is stretched further than its collagen: at a point, integrated outwards, and as it turns over.
 
 It shares no code with the package. Directions: around (0), along (1) and across the wall (2).
 """
@@ -10,13 +10,13 @@ from dataclasses import dataclass
 
 import numpy as np
 from scipy.integrate import solve_ivp
-from scipy.optimize import brentq
 
 from tests.reference.radial import RadialMaterial
 from tests.reference.wall import State, Wall, solved
 
 Array = np.ndarray
 Prestretch = tuple[float, float]
+Layer = tuple[float, float, RadialMaterial, Prestretch]  # between two radii
 
 
 def beyond(prestretch: Prestretch) -> Array:
@@ -31,7 +31,9 @@ def stiffness(r: Array, contour_length: float) -> Array:
     return (1 + (2 - x) / (4 * (1 - x) ** 2)) / contour_length
 
 
-def principal(l: Array, A: Array, of: RadialMaterial, prestretch: Prestretch) -> Array:  # noqa: E741
+def principal(
+    l: Array, A: Array, of: RadialMaterial, prestretch: Prestretch
+) -> Array:  # noqa: E741
     """Cauchy stresses of matrix and chains at stretches l of the collagen, (3,) each."""
     J, start = np.prod(l), of.end_to_end_length
     matrix = of.lame_mu * ((beyond(prestretch) * l) ** 2 - 1) + of.lame_lambda * np.log(J)
@@ -50,50 +52,29 @@ def fresh(of: RadialMaterial, prestretch: Prestretch) -> Array:
     return np.exp(solved(lambda x: principal(np.exp(x), A, of, prestretch), np.zeros(3)))
 
 
-def shot(
-    layers: Sequence[tuple[float, float, RadialMaterial, Prestretch]], pressure: float, axial: float
-) -> tuple[float, float, float]:
-    """Inner and outer radius and axial force of a tube that does not remodel, by shooting outwards.
+def outwards(layers: Sequence[Layer], inner: float, pressure: float, axial: float) -> Array:
+    """Outer radius, radial stress left there, and axial force of a tube with this inner radius.
 
-    Layers are (inner radius, outer radius, tissue, prestretch).
+    It does not remodel; no stress is left if the radius is the one under the pressure.
     """
-    starts = [fresh(of, prestretch) for _, _, of, prestretch in layers]
+    values = np.array([inner, -pressure, 0.0])
+    for low, high, of, prestretch in layers:
+        A, g = isotropic_cells(of), fresh(of, prestretch)
 
-    def outwards(inner: float) -> Array:
-        values = np.array([inner, -pressure, 0.0])
-        for (low, high, of, prestretch), g in zip(layers, starts, strict=True):
-            A = isotropic_cells(of)
+        def slopes(R: float, now: Array) -> list[float]:
+            def stresses(across: Array) -> Array:
+                l = np.array([now[0] / R, axial, across[0]]) * g  # noqa: B023, E741
+                return principal(l, A, of, prestretch)  # noqa: B023
 
-            def slopes(R: float, now: Array) -> list[float]:
-                def stresses(across: float) -> tuple[Array, float]:
-                    l = np.array([now[0] / R, axial, across]) * g  # noqa: B023, E741
-                    return principal(l, A, of, prestretch), across  # noqa: B023
+            thin = np.array([R / now[0] / axial])
+            across = solved(lambda x: stresses(x)[2:] - now[1], thin)
+            hoop, along, _ = stresses(across)
+            steepness = float(across[0])
+            force = 2 * np.pi * along * now[0] * steepness
+            return [steepness, (hoop - now[1]) * steepness / now[0], force]
 
-                stretched = np.array([now[0] / R, axial]) * g[:2]
-                room = of.contour_length**2 - A[:2] @ stretched**2  # noqa: B023
-                if room <= 0:  # the chains lock
-                    raise ArithmeticError
-                most = 0.9999 * np.sqrt(room / A[2]) / g[2]  # noqa: B023
-                stress, across = stresses(
-                    brentq(lambda x: stresses(x)[0][2] - now[1], 0.05, most, xtol=1e-13)
-                )
-                force = 2 * np.pi * stress[1] * now[0] * across
-                return [across, (stress[0] - now[1]) * across / now[0], force]
-
-            way = solve_ivp(slopes, (low, high), values, rtol=1e-9, atol=1e-10)
-            values = way.y[:, -1]
-        return values
-
-    def left(inner: float) -> float:
-        try:
-            return float(outwards(inner)[1])
-        except ArithmeticError:
-            return 1e3
-
-    inner = layers[0][0]
-    inner = brentq(left, inner, 3 * inner, xtol=1e-9)
-    outer, _, force = outwards(inner)
-    return inner, float(outer), float(force)
+        values = solve_ivp(slopes, (low, high), values, rtol=1e-9, atol=1e-10).y[:, -1]
+    return values
 
 
 @dataclass
@@ -117,18 +98,3 @@ class ElasticWall(Wall):
         drive = stretches ** (2 * self.exponent)
         target = self.material.end_to_end_length**2 * drive / drive.sum(axis=0)
         return (self.kappa * (target - A), *super()._rates(state)[1:])
-
-    def unloaded(self) -> tuple[float, float, float]:
-        """Inner and outer radius and length over that of the mesh, without loads."""
-
-        def residual(values: Array) -> Array:
-            r, axial = values[:-1], values[-1]
-            stress = self.stresses(self.stretches(r, axial, self.state), self.state)
-            stress = stress / self.growth(self.state)
-            force = self.weights @ (stress[1] * r * (self.slope @ r))
-            return np.append(self._balance(stress, r, 0.0), force)
-
-        values, first = np.append(self.r, self.length), residual(np.append(self.r, self.length))
-        for share in np.linspace(1.0, 0.0, 11)[1:]:
-            values = solved(lambda v: residual(v) - share * first, values)  # noqa: B023
-        return float(values[0]), float(values[-2]), float(values[-1])
