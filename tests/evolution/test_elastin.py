@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from functools import partial
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -11,7 +12,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from remodel_fenicsx import Recording, Scene
+from remodel_fenicsx import Recording, Scene, read_scene
 from remodel_fenicsx.body.tube import whole_tube
 from remodel_fenicsx.extend import DRIVERS, Driver
 from remodel_fenicsx.model.cells import structure_tensor
@@ -22,40 +23,26 @@ from remodel_fenicsx.running import run
 from remodel_fenicsx.scene import scene_from_dict
 from tests.conftest import Cases, slowly
 from tests.mesh_files import TUBE, write_tube
-from tests.reference.elastin import ElasticWall, fresh, outwards, stiffness
-from tests.reference.radial import RadialMaterial
+from tests.reference.elastin import ElasticWall, fresh, outwards
+from tests.reference.radial import RadialMaterial, secant_stiffness
 from tests.results.test_export_again import again, grown, scene as growing
 from tests.runs import SELF, goes_on, last_row, opening_angle, rows_of, simulated, taylor_orders
 from tests.tables import rows, values
 from tests.values import ANGLES, isotropic, ramped
 
 STIFF = RadialMaterial(lame_mu=7.0, lame_lambda=61.6)
-E8: Any = {
-    "prestretch": (0.92, 1.36),
-    "exponent": 8.0,
-    "pressure": 1.3,
-    "gain": 2.4,
-    "volume": 0.42,
-}
-E4: Any = {"prestretch": (0.92, 1.6), "exponent": 4.0, "pressure": 1.35, "gain": 2.0, "volume": 0.4}
 RADII = ["inner_radius", "outer_radius"]
 GROWN = ["content", "natural_length", "growth"]
 HOOP, AXIAL = (
     [f"{name}_stress{part}" for part in ("_matrix", "_collagen")] for name in ("hoop", "axial")
 )
 
-RAMP, EARLY = (((0.0, 0.0), (end, 1.0)) for end in (25.0, 8.0))
-
-
-def tube(columns: Any = (), kinematics: str = "radial", **tables: Any) -> Scene:
-    """The thin wall of a carotid artery."""
-    of: dict[str, Any] = {
-        "geometry": {"shape": "tube", "inner_radius": 1.0, "outer_radius": 1.3, "length": 1.0},
-        "mesh": {"refinement": 2, "degree": 2},
-        "output": {"fields": False, "report": False, "columns": list(columns)},
-    }
-    of["geometry"] |= tables.pop("geometry", {})
-    return scene_from_dict(isotropic("consistent", kinematics, **of | tables))
+EARLY = {
+    **{f"loads.{name}.ramp": [[0.0, 0.0], [8.0, 1.0]] for name in ("pressure", "elongation")},
+    "time.end": 40.0,
+    "time.step": 4.0,
+    "remodeling.turnover.time": 10.0,
+}
 
 
 def passive(
@@ -68,45 +55,26 @@ def passive(
 ) -> Scene:
     """The default tissue, which does not remodel."""
     of: dict[str, Any] = {
+        "geometry": {"shape": "tube", "inner_radius": 1.0, "outer_radius": 1.3, "length": 1.0},
+        "mesh": {"refinement": 2, "degree": 2},
+        "output": {"fields": False, "report": False, "columns": list(columns)},
         "material": {"elastin": {"prestretch": prestretch}},
         "loads": ramped(24.0, pressure=pressure, elongation=elongation),
         "remodeling": {"law": "none"},
         "time": {"end": 24.0, "step": 4.0},
     }
-    return tube(columns, kinematics, **of | tables)
+    return scene_from_dict(isotropic("consistent", kinematics, **of | tables))
 
 
-def vessel(
-    columns: Any = (),
-    end: Any = "equilibrium",
-    ramp: Any = RAMP,
-    kinematics: str = "radial",
-    turns: bool = True,
-    of: Any = E8,
-    **changes: Any,
-) -> Scene:
-    """E8 of the design, or another one."""
-    of = of | changes
-    remodeling = {"driver": "finger", "kappa": 0.025, "exponent": of["exponent"]}
-    if turns:
-        remodeling["turnover"] = {
-            "time": of.get("time", 40.0),
-            "deposition_stretch": 1.11,
-            "gain": of["gain"],
-            "volume": of["volume"],
-        }
-    loads = ramped(ramp[1][0], pressure=of["pressure"], elongation=0.32)
-    loads["pressure"]["ramp"] = [list(corner) for corner in ramp]
-    material = {"lame_mu": 7.0, "lame_lambda": 61.6, "elastin": {"prestretch": of["prestretch"]}}
-    time = {"end": end} | ({} if end == "equilibrium" else {"step": 4.0, "tolerance": 1.0})
-    time |= of.get("steps", {})
-    tables = {"loads": loads, "material": material, "remodeling": remodeling, "time": time}
-    return tube(columns, kinematics, **tables)
+def vessel(columns: Any, **changes: Any) -> Scene:
+    """Of elastin.toml, by dotted keys."""
+    scene = read_scene(Path(__file__).with_name("elastin.toml"))
+    return scene.with_values({"output.columns": list(columns)} | changes)
 
 
-def measured(simulation: Any, time: float = 0.0) -> Measurement:
+def measured(simulation: Any) -> Measurement:
     """Of the present state."""
-    return Measurement(simulation.observer, SimpleNamespace(time=time))  # type: ignore[arg-type]
+    return Measurement(simulation.observer, SimpleNamespace(time=0.0))  # type: ignore[arg-type]
 
 
 def seen(simulation: Any, names: Any) -> dict[str, float]:
@@ -189,9 +157,10 @@ def balanced(layers: Any, row: dict[str, float], axial: float = 1.1) -> None:
 def test_a_prestretch_of_one_changes_no_digit() -> None:
     """Also not of a wall that remodels."""
     names = [*RADII, *ANGLES, "content", "elastin_stretch_axial", *HOOP]
-    plain = vessel(names, 40.0, prestretch=(1.0, 1.0))
-    material = {"lame_mu": 7.0, "lame_lambda": 61.6}
-    without = plain.with_values({"material": material})
+    key, material = "material.elastin.prestretch", {"lame_mu": 7.0, "lame_lambda": 61.6}
+    plain, without = (
+        vessel(names, **EARLY | change) for change in ({key: (1.0, 1.0)}, {"material": material})
+    )
     assert plain.is_stress_free and not plain.material.has_elastin
     for one, other in zip(*map(rows_of, (plain, without)), strict=True):
         assert one | {"seconds": 0.0} == other | {"seconds": 0.0}
@@ -224,8 +193,6 @@ def test_a_whole_tube_is_the_one_on_a_radius() -> None:
     assert [whole[name] for name in names] == pytest.approx(
         [radial[name] for name in names], rel=1e-3, abs=1e-2
     )
-    for name in RADII:
-        assert whole[name] == pytest.approx(radial[name], rel=1e-4)
 
 
 def own_values(file: Path, **tables: Any) -> dict[str, Any]:
@@ -253,7 +220,7 @@ def test_an_own_mesh_of_the_tube_is_the_tube(tmp_path: Path) -> None:
     alone, row = last_row(own(file, loads={}, time={"end": 1.0})), last_row(own(file, **loads))
     polygon = 3 * np.pi * np.sinc(1 / 12)
     assert alone["lumen_volume"] == pytest.approx(polygon, rel=1e-3)
-    same: Any = {"geometry": {"outer_radius": 2.0, "length": 3.0}}
+    same: Any = {"geometry": {"shape": "tube", "inner_radius": 1, "outer_radius": 2, "length": 3}}
     radial = last_row(passive([*RADII, *ALONG], (1.2, 1.5), **SHORT | loads, **same))
     radius = np.sqrt(row["lumen_volume"] / 1.1 / polygon)
     assert radius == pytest.approx(radial["inner_radius"], rel=0.01)
@@ -263,37 +230,29 @@ def test_an_own_mesh_of_the_tube_is_the_tube(tmp_path: Path) -> None:
 
 
 # ---------------------------------------------------------------- walls at rest
-PATHS: Any = {"higher": (5000.0, ((2500.0, 1.0), (2525.0, 1.5)))}
-PATHS["back"] = (7500.0, (*PATHS["higher"][1], (5000.0, 1.5), (5025.0, 1.0)))
 RESTS = rows(__file__, "elastin_rests.txt")
+numbers = partial(np.fromstring, sep=" ")
 MEANS = ["wall_thickness", "mean_hoop_stress", "reduced_axial_force", *GROWN]
 
 
 @pytest.mark.parametrize(
-    ("case", "means", "angles", "cut", "unloaded", "forces"),
+    ("changes", "means", "angles", "cut", "unloaded", "forces"),
     [tuple(RESTS[0]), *slowly(*map(tuple, RESTS[1:]))],
 )
 def test_walls_rest_where_an_independent_program_says(
-    case: str, means: str, angles: str, cut: str, unloaded: str, forces: str
+    changes: str, means: str, angles: str, cut: str, unloaded: str, forces: str
 ) -> None:
     """Radii, means, angles, cut, radii and length without loads, force under other pressures."""
-    name, _, change = case.partition(" ")
-    of = {"E8": E8, "E4": E4}[name]
-    if change in PATHS:
-        end, ramp = PATHS[change]
-        scene = vessel((), end, (*RAMP, *ramp), of=of)
-    else:
-        scene = vessel(of=of, **values(change))
+    scene = vessel([], **values(changes))
     turnover = scene.remodeling.turnover
     changing = {"growth": turnover.grows} | dict.fromkeys(GROWN[:2], turnover.is_on)
     columns = [name for name in MEANS if changing.get(name, True)]
     columns += ["inner_radius", "outer_radius", "axial_force", *ANGLES]
-    eighths = {"output.columns": columns, "mesh.refinement": 1}
-    with simulated(scene.with_values(eighths)) as (simulation, of_run):
+    with simulated(scene.with_values({"output.columns": columns})) as (simulation, of_run):
         row = of_run[-1]
         assert opening_angle(simulation) == pytest.approx(float(cut), abs=2.0)
-        if case == "E8":
-            identities_at_rest(simulation, 8.0, 1.11)
+        if "E8" in changes:
+            identities_at_rest(simulation)
         slack = without_loads(simulation)
         pressed = [held(simulation, share * row["pressure"], 0.32) for share in (0.75, 1.25)]
     inner, *others = numbers(means)
@@ -302,43 +261,33 @@ def test_walls_rest_where_an_independent_program_says(
     assert [row[name] for name in ANGLES] == pytest.approx(numbers(angles), abs=0.5)
     assert slack == pytest.approx(numbers(unloaded), rel=0.005)
     ratios = [one["reduced_axial_force"] / row["reduced_axial_force"] for one in pressed]
-    assert not forces or ratios == pytest.approx(numbers(forces), abs=0.01)
+    assert forces == "-" or ratios == pytest.approx(numbers(forces), abs=0.01)
 
 
-def numbers(text: str) -> list[float]:
-    """Parted by blanks."""
-    return [float(word) for word in text.split()]
-
-
-def identities_at_rest(simulation: Any, exponent: float, deposition_stretch: float) -> None:
+def identities_at_rest(simulation: Any) -> None:
     """tan a = (l_z/l_t)^n and r/rho = lambda_h r0, at every point."""
     axes = simulation.cells.local_axes.axes.reshape(-1, 3, 3)
     F = simulation.state.elastic_gradient().reshape(-1, 3, 3)
     around, along, _ = np.linalg.norm(np.einsum("nij,nkj->nki", F, axes), axis=-1).T
     A = structure_tensor(*simulation.cells.point_cells[:2])
     hoop, axial, _ = np.einsum("nij,njk,nik->in", axes, A, axes)
-    np.testing.assert_allclose(np.sqrt(axial / hoop), (along / around) ** exponent, rtol=1e-3)
+    np.testing.assert_allclose(np.sqrt(axial / hoop), (along / around) ** 8, rtol=1e-3)
     tissue = simulation.stepper.remodeling.parameters.at_points()
     r = np.sqrt(np.einsum("nij,nji->n", A, F.swapaxes(1, 2) @ F)) / tissue.natural_length
-    np.testing.assert_allclose(r, deposition_stretch * tissue.end_to_end_length, rtol=1e-3)
+    np.testing.assert_allclose(r, 1.11 * tissue.end_to_end_length, rtol=1e-3)
 
 
-@pytest.mark.parametrize("gain", [2.4, *slowly(0.35)])
-def test_a_wall_on_its_way_is_that_of_the_reference(gain: float) -> None:
+def test_a_wall_on_its_way_is_that_of_the_reference() -> None:
     """Fine steps, and what a cut opens."""
     reference = ElasticWall(
-        STIFF, (1.0, 1.3), 0.0, 0.025, 10.0, 1.11, gain, 0.42,
-        prestretch=E8["prestretch"], exponent=8.0,
+        STIFF, (1.0, 1.3), 0.0, 0.025, 10.0, 1.11, 2.4, 0.42,
+        prestretch=(0.92, 1.36), exponent=8.0,
     )  # fmt: skip
     reference.run(1.3, 0.32, 8.0, 20.0, 0.5)
     expected = reference.row()
-    columns = [*expected, "outer_radius", "reduced_axial_force"]
-    steps = {"step": 0.5, "tolerance": None}
-    scene = vessel(
-        columns, 20.0, EARLY,
-        gain=gain, time=10.0, steps=steps,
-    )  # fmt: skip
-    with simulated(scene.with_values({"mesh.refinement": 4})) as (simulation, of_run):
+    fine = {"time.end": 20.0, "time.step": 0.5, "mesh.refinement": 6}
+    scene = vessel(expected, **EARLY | fine)
+    with simulated(scene) as (simulation, of_run):
         assert opening_angle(simulation) == pytest.approx(reference.cut(), abs=0.5)
     for name, value in expected.items():
         assert of_run[-1][name] == pytest.approx(value, rel=2e-3), name
@@ -377,7 +326,7 @@ def network_by_hand(simulation: Any) -> np.ndarray:
     growth = simulation.stepper.part("turnover").growth.ratio.reshape(-1)
     J, rho = np.linalg.det(F) * growth, of.natural_length
     r = np.sqrt(np.einsum("nij,nij->n", F @ A, F)) / rho
-    g, g0 = stiffness(r, of.contour_length), stiffness(of.end_to_end_length, of.contour_length)
+    g, g0 = (secant_stiffness(length, of.contour_length) for length in (r, of.end_to_end_length))
     pulled = (g / rho**2)[:, None, None] * (F @ A @ F.swapaxes(1, 2))
     pushed = np.asarray(g0)[..., None, None] * A  # axes of A and of C are the same
     return np.asarray((of.content * of.network_modulus / J)[:, None, None] * (pulled - pushed))
@@ -385,23 +334,21 @@ def network_by_hand(simulation: Any) -> np.ndarray:
 
 def test_a_driver_may_take_the_stress_of_collagen_alone() -> None:
     """By hand; it has no elastin in it, and the columns of both parts are the whole stress."""
-    names = [*HOOP, *AXIAL, "hoop_stress_middle"]
     mine = Driver(lambda F, stresses: stresses.collagen.cauchy, False)  # type: ignore[union-attr]
     with patch.dict(DRIVERS, mine=mine):
-        steps = {"step": 4.0, "tolerance": None}
-        scene = vessel(names, 40.0, EARLY, steps=steps, time=10.0)
-        scene = scene.with_values({"remodeling.driver": "mine", "remodeling.exponent": 2.0})
+        mine_alone = {"remodeling.driver": "mine", "remodeling.exponent": 2.0}
+        scene = vessel(HOOP, **EARLY | mine_alone)
         with simulated(scene) as (simulation, _):
             remodeling = simulation.stepper.remodeling
             collagen, expected = remodeling.driving_tensor()[1], network_by_hand(simulation)
             whole = measured(simulation).stress.reshape(-1, 3, 3)
-            parts = seen(simulation, names)
+            parts = seen(simulation, HOOP)
             content = remodeling.parameters.at_points().content
     assert np.ptp(content) > 0.01
     np.testing.assert_allclose(collagen.reshape(-1, 3, 3), expected, atol=1e-10)
     assert np.abs(whole - expected).max() > 1.0
-    assert sum(parts[name] for name in HOOP) == pytest.approx(whole[:, 1, 1].mean(), rel=0.01)
-    assert sum(parts[name] for name in AXIAL) == pytest.approx(whole[:, 2, 2].mean(), rel=0.01)
+    assert sum(parts.values()) == pytest.approx(whole[:, 1, 1].mean(), rel=0.01)
+    assert parts[HOOP[1]] == pytest.approx(expected[:, 1, 1].mean(), rel=0.01)
 
 
 # ---------------------------------------------------------------- what is said, and runs that go on
@@ -416,9 +363,7 @@ def test_what_has_no_elastin_says_so_in_one_line(changes: str, line: str) -> Non
 
 def test_a_run_goes_on(tmp_path: Path) -> None:
     """Of a wall that grows."""
-    names = [*RADII, *ANGLES, "content", "growth", *HOOP]
-    scene = vessel(names, 40.0, EARLY, steps={"step": 4.0, "tolerance": None}, time=10.0)
-    found = goes_on(scene, tmp_path, 12.0, 24.0)
+    found = goes_on(vessel([*RADII, "growth", *HOOP], **EARLY), tmp_path, 12.0, 24.0)
     assert found.history["growth"][-1] != pytest.approx(1.0, abs=1e-2)
     assert "prestretch = [0.92, 1.36]" in (found.path / "scene.toml").read_text()
 
@@ -430,16 +375,13 @@ def test_what_export_writes_begins_the_same_run(tmp_path: Path) -> None:
     """With the natural state that made fresh tissue stress-free; of tetrahedra, one F each."""
     mesh = write_tube(tmp_path / "tube.msh", "tetrahedron")
     tables: Any = {
-        "natural": {},
         "material": {"repulsion": "log", "elastin": {"prestretch": [0.92, 1.36]}},
         "output": {"columns": [*KEPT], "report": False},
         "remodeling": grown(),
     }
-    started = run(growing(mesh, 3.0, **tables), tmp_path / "run", SELF)
+    started = run(growing(mesh, 3.0, natural={}, **tables), tmp_path / "run", SELF)
     file = export(started, "vtu", tmp_path / "first.vtu", 2.0)
-    second = run(
-        again(mesh, file, 2.0, **tables | {"natural": {"fibres": True}}), tmp_path / "second", SELF
-    )
+    second = run(again(mesh, file, 2.0, **tables), tmp_path / "second", SELF)
     original, read = (Recording(folder).history for folder in (started, second))
     assert abs(original["growth"][2] - 1.0) > 1e-3
     for name in KEPT:

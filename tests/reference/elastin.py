@@ -11,7 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.integrate import solve_ivp
 
-from tests.reference.radial import RadialMaterial
+from tests.reference.radial import RadialMaterial, cauchy_stress
 from tests.reference.wall import State, Wall, solved
 
 Array = np.ndarray
@@ -25,31 +25,17 @@ def beyond(prestretch: Prestretch) -> Array:
     return np.array([around, along, 1 / (around * along)])
 
 
-def stiffness(r: Array, contour_length: float) -> Array:
-    """g(r), of a wormlike chain."""
-    x = r / contour_length
-    return (1 + (2 - x) / (4 * (1 - x) ** 2)) / contour_length
-
-
-def principal(
-    l: Array, A: Array, of: RadialMaterial, prestretch: Prestretch
-) -> Array:  # noqa: E741
-    """Cauchy stresses of matrix and chains at stretches l of the collagen, (3,) each."""
-    J, start = np.prod(l), of.end_to_end_length
-    matrix = of.lame_mu * ((beyond(prestretch) * l) ** 2 - 1) + of.lame_lambda * np.log(J)
-    g, g0 = (stiffness(r, of.contour_length) for r in (np.sqrt(A @ l**2), start))
-    return np.asarray((matrix + of.network_modulus * A * (g * l**2 - g0)) / J)
-
-
-def isotropic_cells(of: RadialMaterial) -> Array:
-    """A of cells without directions."""
-    return np.full(3, of.end_to_end_length**2 / 3)
+def principal(stretches: Array, of: RadialMaterial, prestretch: Prestretch) -> Array:
+    """Cauchy stresses of matrix and isotropic cells at stretches of the collagen, (3,) each."""
+    squares = np.full((1, 3), of.end_to_end_length**2 / 3)
+    plain = cauchy_stress(stretches[None], squares, of)[0]
+    more = (beyond(prestretch) ** 2 - 1) * stretches**2
+    return np.asarray(plain + of.lame_mu * more / np.prod(stretches))
 
 
 def fresh(of: RadialMaterial, prestretch: Prestretch) -> Array:
     """Stretches at which the matrix and new collagen balance."""
-    A = isotropic_cells(of)
-    return np.exp(solved(lambda x: principal(np.exp(x), A, of, prestretch), np.zeros(3)))
+    return np.exp(solved(lambda x: principal(np.exp(x), of, prestretch), np.zeros(3)))
 
 
 def outwards(layers: Sequence[Layer], inner: float, pressure: float, axial: float) -> Array:
@@ -59,12 +45,12 @@ def outwards(layers: Sequence[Layer], inner: float, pressure: float, axial: floa
     """
     values = np.array([inner, -pressure, 0.0])
     for low, high, of, prestretch in layers:
-        A, g = isotropic_cells(of), fresh(of, prestretch)
+        g = fresh(of, prestretch)
 
         def slopes(R: float, now: Array) -> list[float]:
             def stresses(across: Array) -> Array:
-                l = np.array([now[0] / R, axial, across[0]]) * g  # noqa: B023, E741
-                return principal(l, A, of, prestretch)  # noqa: B023
+                stretches = np.array([now[0] / R, axial, across[0]]) * g  # noqa: B023
+                return principal(stretches, of, prestretch)  # noqa: B023
 
             thin = np.array([R / now[0] / axial])
             across = solved(lambda x: stresses(x)[2:] - now[1], thin)
