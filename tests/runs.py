@@ -67,7 +67,7 @@ def last_row(scene: Scene | Mapping[str, Any], domain: Any = None) -> dict[str, 
 
 
 def opening_angle(simulation: Simulation, release: str = "cut") -> float:
-    """Of a cut of the present state of a tube, or its `unloaded_stretch`; columns are of every row."""
+    """Of a cut of a tube as it is, or its `unloaded_stretch`; columns would do it in every row."""
     step: Any = SimpleNamespace(time=0.0)
     return _of_rings(release, Measurement(simulation.observer, step))
 

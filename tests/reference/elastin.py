@@ -1,4 +1,4 @@
-"""A tube whose matrix is stretched further than its collagen: at a point, integrated outwards, and as it turns over.
+"""A tube whose matrix is stretched further than its collagen: at a point, outwards, in turnover.
 
 It shares no code with the package. Directions: around (0), along (1) and across the wall (2).
 """
