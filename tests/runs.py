@@ -66,10 +66,10 @@ def last_row(scene: Scene | Mapping[str, Any], domain: Any = None) -> dict[str, 
     return rows_of(scene, domain)[-1]
 
 
-def opening_angle(simulation: Simulation) -> float:
-    """Of a cut of the present state of a tube; the column would cut in every row."""
+def opening_angle(simulation: Simulation, release: str = "cut") -> float:
+    """Of a cut of a tube as it is, or its `unloaded_stretch`; columns would do it in every row."""
     step: Any = SimpleNamespace(time=0.0)
-    return _of_rings("cut", Measurement(simulation.observer, step))
+    return _of_rings(release, Measurement(simulation.observer, step))
 
 
 def columns_of(scene: Scene | Mapping[str, Any], domain: Any = None) -> dict[str, np.ndarray]:

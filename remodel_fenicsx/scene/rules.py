@@ -223,9 +223,11 @@ def natural_state(scene: Scene) -> Faults:
         return
     value: object
     key, value = "natural.layers", len(natural.layers)
-    if natural.is_trivial:
-        key, value = "material.elastin.prestretch", scene.material.elastin.prestretch
-        none = "[1.0, 1.0]"
+    for name, properties in scene.properties().items():
+        if properties.material.has_elastin:
+            key, none = f"{in_region(name)}material.elastin.prestretch", "[1.0, 1.0]"
+            value = properties.material.elastin.prestretch
+            break
     if natural.opening_angle:
         key, value = "natural.opening_angle", natural.opening_angle
         able, none = RoundWall, "0"
@@ -235,7 +237,8 @@ def natural_state(scene: Scene) -> Faults:
     ]
     if isinstance(shape, RoundWall):
         needs.append(("cells.axes", scene.cells.axes == "cylindrical", "'cylindrical'"))
-        for name, properties in scene.properties().items():
+    for name, properties in scene.properties().items():
+        if isinstance(shape, RoundWall) or properties.material.has_elastin:
             needs.append(
                 (
                     f"{in_region(name)}cells.initial",
