@@ -24,7 +24,7 @@ NAMES = {"regions": "media", "loads": "wall", "supports": "outer"}  # that some 
 VALUES: list[Any] = [
     None, True, False, 0, 1, 2, 7, 0.0, 0.25, 0.3, 0.5, 1.1, 30.0, 1500.0, "mm", "kPa", "10 mm", "1.5 kPa",
     "/tmp/ä' \"b.vtu", "a" * 64, "equilibrium", "kuhl-holzapfel-2007", "fast", "inner", "pressure", "clamped",
-    [], [0.5], [1.0], [0.6, 0.8, 0.0], RAMP, ["fibre_angle", "cells"], ["outer_area"], ["lumen_volume"],
+    [], [0.5], [1.0], [0.6, 0.8, 0.0], [0.9, 1.25], RAMP, ["fibre_angle", "cells"], ["outer_area"], ["lumen_volume"],
     {}, {"axial": 1.1}, {"value": 2.0, "ramp": RAMP}, {"wall": LOAD}, {"inner": 3, "outer": ["outer"]},
     {"ksp_type": "preonly", "snes_monitor": True}, {"media": {}}, {"media": {"outer_radius": 2.0}}, {"time": 3.0},
     {"kind": "elastic", "stiffness": 1.0}, [{"from": 0.25, "to": 0.5, "prestretch": {"axial": 1.1}}],
@@ -55,6 +55,9 @@ def bases(tmp_path_factory: pytest.TempPathFactory) -> list[Scene]:
         ),
         scene_from_dict(mesh),
         scene_from_dict({"geometry": {"shape": "solid", "file": str(file)}, "time": {"end": 3.0}}),
+        preset_scene("consistent", "tube").with_values(
+            {"cells.initial": "isotropic", "regions": {"media": {"outer_radius": 2.0}, "rest": {}}}
+        ),
         *(preset_scene("consistent", shape) for shape in ("cube", "tendon", "sheet")),
     ]
 
