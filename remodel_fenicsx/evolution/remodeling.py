@@ -324,14 +324,14 @@ class RemodelingPass(Remodels):
         """Return the Mandel components of A, (n, 6)."""
         return tensors.to_mandel(structure_tensor(*values[:2]))
 
-    def moved(self, values: UnitCell, change: Array) -> UnitCell:
+    def with_change(self, values: UnitCell, change: Array) -> UnitCell:
         """Return cells after a change of A, in Mandel components."""
         squared, axes = spectral.principal_by_continuity(
             structure_tensor(*values[:2]) + tensors.from_mandel(change), values.axes
         )
         return UnitCell(np.sqrt(np.maximum(squared, 0.0)), axes)
 
-    def passed(self, values: UnitCell, time: float, residual: float) -> UnitCell:
+    def after_pass(self, values: UnitCell, time: float, residual: float) -> UnitCell:
         """Return cells after a pass up to a time."""
         return (
             self.updated_cells(self.state.time, time, residual, values)[0]
@@ -339,16 +339,16 @@ class RemodelingPass(Remodels):
             else values
         )
 
-    def apart(self, values: UnitCell, other: UnitCell) -> float:
+    def distance_between(self, values: UnitCell, other: UnitCell) -> float:
         """Return the RMS of the angle between chain directions over the body, in degrees."""
         angles = angle_between(values, other).reshape(self.quadrature.shape)
         return float(np.sqrt(self.quadrature.mean(angles**2)))
 
-    def left(self, time: float, residual: float) -> float:
+    def remaining_change(self, time: float, residual: float) -> float:
         """Return the largest change of A by a pass, over r0^2."""
         return self.size(self._change_by_a_pass(time, residual))
 
-    def to_the_limit(self, time: float, duration: float, residual: float) -> Array:
+    def change_to_limit(self, time: float, duration: float, residual: float) -> Array:
         """Return the change of A by a pass up to a time, zero at points without tension."""
         change = self._change_by_a_pass(time, residual)
         change[self.without_tension(residual).reshape(self.quadrature.shape)] = 0.0
@@ -359,7 +359,7 @@ class RemodelingPass(Remodels):
         r0 = self.parameters.at_points().end_to_end_length.reshape(self.quadrature.shape)
         return self.quadrature.maximum(np.linalg.norm(change, axis=(-1, -2)) / r0**2)
 
-    def follow(self, change: Array, factor: float, time: float, residual: float) -> None:
+    def apply_change(self, change: Array, factor: float, time: float, residual: float) -> None:
         """Apply a multiple of the change of a pass up to a time."""
         remodeled, _ = self.updated_cells(self.state.time, time, residual)
         cells = self.state.cells

@@ -104,7 +104,7 @@ class TimeError:
             if admissible:
                 pairs = zip(self.remodels, rows, strict=True)
                 betters = [
-                    process.passed(row, step.time, step.work.residual) for process, row in pairs
+                    process.after_pass(row, step.time, step.work.residual) for process, row in pairs
                 ]
         limit, angle = SLOWEST * angle, self._distance(rows, betters)
         if angle > limit:  # the pass leads to another state, to which this state does not tend
@@ -123,7 +123,7 @@ class TimeError:
             self.remodels, self._last, rows, strict=True
         )
         return [
-            process.moved(row, ratio * last.values[0].reshape(-1, process.components))
+            process.with_change(row, ratio * last.values[0].reshape(-1, process.components))
             for process, last, row in processes
         ]
 
@@ -143,7 +143,7 @@ class TimeError:
             self.remodels, self._errors, rows, _known(betters, rows), strict=True
         ):
             error = max(
-                process.apart(row, better), strain if process is self.stepper.remodeling else 0.0
+                process.distance_between(row, better), strain if process is self.stepper.remodeling else 0.0
             )
             # Bounded rates do not change for longer than the cells do.
             limits.append(_accumulated_error(error, max(self.kappa, process.slowest) * duration))
@@ -209,7 +209,7 @@ class TimeError:
     def _distance(self, rows: AllValues, betters: AllValues) -> float:
         """Return the largest distance over all remodeling processes, in degrees."""
         return max(
-            process.apart(*pair)
+            process.distance_between(*pair)
             for process, *pair in zip(self.remodels, rows, betters, strict=True)
         )
 

@@ -225,23 +225,23 @@ class TurnoverPass(Remodels):
         """Return the values by points, (n, 2)."""
         return values.T
 
-    def moved(self, values: Array, change: Array) -> Array:
+    def with_change(self, values: Array, change: Array) -> Array:
         """Return values after a change of their components (n, 2)."""
         return values + change.T
 
-    def passed(self, values: Array, time: float, residual: float) -> Array:
+    def after_pass(self, values: Array, time: float, residual: float) -> Array:
         """Return values after a step with the rates of the present state and cells."""
         return changed(values, self.rates(present=True), time - self.state.time)
 
-    def apart(self, values: Array, other: Array) -> float:
+    def distance_between(self, values: Array, other: Array) -> float:
         """Return the largest relative difference of m or rho, as radians converted to degrees."""
         return float(np.degrees(self.size((other - values).T.reshape(*self.quadrature.shape, 2))))
 
-    def left(self, time: float, residual: float) -> float:
+    def remaining_change(self, time: float, residual: float) -> float:
         """Return the largest relative change up to a time."""
         return self.quadrature.maximum(self.fastest_changes()) * (time - self.state.time)
 
-    def to_the_limit(self, time: float, duration: float, residual: float) -> Array:
+    def change_to_limit(self, time: float, duration: float, residual: float) -> Array:
         """Return the changes over a duration, because turnover has no pass to a limit."""
         return np.asarray(self.rates().T * duration).reshape(*self.quadrature.shape, 2)
 
@@ -249,8 +249,8 @@ class TurnoverPass(Remodels):
         """Return the largest relative change."""
         return self.quadrature.maximum(np.abs(change).max(axis=-1))
 
-    def follow(self, change: Array, factor: float, time: float, residual: float) -> None:
-        """Apply a multiple of the change of `to_the_limit`."""
+    def apply_change(self, change: Array, factor: float, time: float, residual: float) -> None:
+        """Apply a multiple of the change of `change_to_limit`."""
         self.change(change.reshape(-1, 2).T, factor)
 
     def begin_path(self) -> None:
@@ -273,7 +273,7 @@ class TurnoverPass(Remodels):
             f"{self.state.time:g}; try a larger remodeling.turnover.gain"
         )
 
-    def rested(self, time: float) -> None:
+    def start_at_rest(self, time: float) -> None:
         """Start volumetric growth at a time."""
         if self.growth is not None:
             self.growth.start = time
