@@ -97,7 +97,7 @@ class Homeostasis:
         """Yield the steady state as one committed step."""
         self.stepper.start(watchers)
         for time in self.remaining():
-            yield self.stepper.advance(time, watchers, is_last=True, strategy=self)
+            yield self.stepper.advance(time, watchers, is_last=True, coupling=self)
 
     def solve(self, time: float, loads: LoadValues) -> Work:
         """Solve for the equilibrium of forces and of cells."""
@@ -127,7 +127,7 @@ class Homeostasis:
         """Integrate to the steady state under constant loads, then start waiting processes."""
         stops = [*(stop for stop in self.plan.stops if stop <= held), self.plan.stops[-1]]
         control = self.control.with_stops(stops)
-        with self.stepper.holding(held):
+        with self.stepper.constant_loads_from(held):
             self._integrate(control, stops[-1], self.stepper.load_values(held), held, False, work)
         self.state.mark_cells_in_equilibrium()
         log.info("steady state reached after %d steps, before time %g", self.steps, change)

@@ -30,9 +30,10 @@ class Remodels:
     (elements, points, 3, 3) for the cells.
 
     With `changes` a subclass overrides `before` or `after`, `set_part` and `remaining_change`. For
-    an estimated time discretisation error it sets `components`, and overrides `row`, `higher_order`,
-    `set`, `as_components`, `with_change`, `after_pass` and `distance_between` together. For a
-    steady state with `components` it also overrides `change_to_limit`, `size` and `apply_change`.
+    an estimated time discretisation error it sets `components`, and overrides `row`,
+    `higher_order`, `set`, `as_components`, `with_change`, `after_pass` and `distance_between`
+    together. For a steady state with `components` it also overrides `change_to_limit`, `size` and
+    `apply_change`.
 
     Attributes
     ----------

@@ -143,7 +143,8 @@ class TimeError:
             self.remodels, self._errors, rows, _known(betters, rows), strict=True
         ):
             error = max(
-                process.distance_between(row, better), strain if process is self.stepper.remodeling else 0.0
+                process.distance_between(row, better),
+                strain if process is self.stepper.remodeling else 0.0,
             )
             # Bounded rates do not change for longer than the cells do.
             limits.append(_accumulated_error(error, max(self.kappa, process.slowest) * duration))
@@ -230,7 +231,7 @@ class TimeError:
     def _answered(self, case: LoadCaseSolver, before: Array, tangents: int) -> tuple[float, bool]:
         """Return length change and admissibility of one load case; `before` is its earlier F_e."""
         state, equilibrium = case.state, case.coupling.equilibrium
-        state.unknown.x.array[:] += case.coupling.newton.answer(equilibrium, tangents)
+        state.unknown.x.array[:] += case.coupling.newton.newton_correction(equilibrium, tangents)
         after, admissible = state.elastic_gradient(), equilibrium.extension().admissible
         changes = np.minimum(max_stretch_increment(before, after), LARGEST_LINEAR_CHANGE)
         changes = changes.reshape(self.quadrature.shape)
@@ -335,7 +336,7 @@ class StepControl:
                 watchers,
                 time == self.stops[-1],
                 before,
-                control_error=self._accept_or_reject,
+                measure_error=self._accept_or_reject,
             )
             outcome = attempted(advance, StepFailure, StepRejectedError)
             if isinstance(outcome, Step):

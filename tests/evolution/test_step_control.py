@@ -290,7 +290,7 @@ def controlled(
     simulation = Simulation(
         tube("staggered", end, **{"time.tolerance": 1.0, **changes}), MPI.COMM_SELF
     )
-    control = simulation.way
+    control = simulation.time_stepping
     assert control is not None
 
     def measured(step: Step) -> Estimate:
