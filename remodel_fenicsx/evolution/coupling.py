@@ -35,8 +35,8 @@ NO_TIME = -1.0  # time of a target before the first one
 # Targets with a switch below this are ignored: they change the cells by less than the time error
 # of a step.
 MIN_TARGET_WEIGHT = 0.01
-# The prediction is a weighted sum of so many rates. The weights are those with which the same sum
-# predicts so many of the newest known rates best.
+# Number of rates in the weighted sum that predicts the next rate, and number of known rates to
+# which its weights are fitted.
 SUMMED, FITTED = 3, 2
 SAME_RATE = 1e-9  # relative tolerance of equal load rates
 INDEPENDENT = 1e-12  # relative singular value below which rates depend on each other up to rounding
@@ -282,7 +282,7 @@ class Staggered:
             process.before(time, self.traits.order)
 
     def solve_equilibrium(self, time: float, loads: LoadValues, again: bool = False) -> Work:
-        """Solve for equilibrium with the present cells, then call `settle` of all processes beside.
+        """Solve for equilibrium with the present cells, then call `settle` of further processes.
 
         Parameters
         ----------

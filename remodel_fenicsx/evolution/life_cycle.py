@@ -207,4 +207,4 @@ class Remodels:
         return ""
 
     def start_at_rest(self, time: float) -> None:
-        """Start at a time if the process waits for the steady state of the other processes."""
+        """Start at a time if the process waits for a first steady state."""

@@ -390,7 +390,7 @@ class UnboundedGrowth(WarnsOnce):
             return ""
         return (
             "turnover has not reached equilibrium: content or natural length change by up to "
-            f"{100 * rate * period:.2g} % during one remodeling.turnover.time, most at "
+            f"{100 * rate * period:.2g} % within one remodeling.turnover.time, most at "
             f"{self.quadrature.shown_place_of_largest(rates)}, and the rates have decayed no "
             f"faster than 1/t since time {self.held_from + self._numbers['early_time']:g} "
             "(mechanobiological instability, docs/tissue_that_lives.md). "

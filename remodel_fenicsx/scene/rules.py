@@ -119,7 +119,7 @@ def loaded_body(scene: Scene) -> Faults:
     if scene.supports.ends == "clamped":
         yield "not allowed with supports.ends = 'clamped': the loaded radius would vary", key, value
     if measured := ", ".join(f"{in_region(name)}cells.fibres" for name in scene.measured_cells):
-        yield f"not allowed with {measured}: its positions are those of the loaded geometry", key, value
+        yield f"not allowed with {measured}: it has positions of the loaded geometry", key, value
     if scene.cases:
         rule = (
             "not allowed with [[cases]]: the loaded geometry belongs to one set of loads; run "
