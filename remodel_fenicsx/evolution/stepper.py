@@ -106,7 +106,7 @@ class Step:
 
     @property
     def is_due(self) -> bool:
-        """Whether watchers check slow changes in this step: the first, the last, or a fifth one."""
+        """Whether watchers check slow changes here: in the first, last, and every fifth step."""
         return self.is_last or self.number % CHECK_INTERVAL == 1
 
     @property
