@@ -148,7 +148,7 @@ def test_factors_of_every_kind(caplog: pytest.LogCaptureFixture) -> None:
     )
     assert kinds == [cholmod, symmetric, unsymmetric, cholmod, cholmod]
     assert [record.message for record in caplog.records] == [
-        "Cholesky factorisation of the tangent failed"
+        "Cholesky factorisation of the tangent failed (tried in this order: Cholesky, LDL^T, LU)"
     ]
     factor.renew(matrix_of(np.zeros((30, 30))))
     factor.apply(None, x, y)
