@@ -366,11 +366,11 @@ def test_what_the_bound_spares_is_admissible(monkeypatch: pytest.MonkeyPatch) ->
     assert sum(spared) > len(spared) / 2
     equilibrium, x = simulation.stepper.coupling.equilibrium, simulation.unknown.x.array
     for far in (0.95, 0.99, 1.0):  # as far as the bound allows, in many directions
-        room, start = equilibrium.room(far), x.copy()
+        change, start = equilibrium.safe_change(far), x.copy()
         for seed in range(5):
             way = np.random.default_rng(seed).standard_normal((len(x) // 3, 3))
             way /= np.linalg.norm(way, axis=1).max()
-            x[:] = start + 0.999 * room / simulation.quadrature.largest_gradient * way.ravel()
+            x[:] = start + 0.999 * change / simulation.quadrature.largest_gradient * way.ravel()
             extension = equilibrium.extension()
             assert extension.admissible and extension.max_chain_extension < far
         x[:] = start
