@@ -214,7 +214,7 @@ def _check_complete(values: dict[str, Any], before: dict[str, Any], place: Path)
     """Check that a recorded scene has all values: a truncated file could be valid with defaults."""
     had, has = (dict(leaves(scene, ("loads",))) for scene in (before, values))
     if lost := had.keys() - has.keys():
-        rule = f"lacks {min(lost)}, which the run had; restore the key, or set another value"
+        rule = f"lacks {min(lost)}, which the run had; add the key with its old or a new value"
         raise RecordingError(f"{place / SCENE}: {rule}")
 
 
@@ -249,7 +249,7 @@ def _petsc_errors_as_scene_errors(scene: Scene) -> Iterator[None]:
     except PETSc.Error as error:
         if not (given := scene.solver.petsc_options):
             raise
-        rule = f"PETSc rejects them (error {error.ierr}); must be options of its manual pages"
+        rule = f"PETSc rejects them (error {error.ierr}); PETSc's manual pages list all options"
         raise SceneError(f"solver.petsc_options = {format_value(given)}: {rule}") from error
 
 
@@ -294,7 +294,7 @@ def _record(
         steps = (
             scene.time.number_of_steps
             if scene.time.is_adaptive
-            else state.number + len(simulation.way.remaining())
+            else state.number + len(simulation.time_stepping.remaining())
         )
         rank, done = -1 if quiet else comm.rank, scene.time.progress(state.number, state.time)
         progress = stack.enter_context(Progress(steps, scene.name, rank, done=done))

@@ -13,7 +13,7 @@ from mpi4py import MPI
 from remodel_fenicsx.body.domain import Domain
 from remodel_fenicsx.body.loading import LoadValues, values_of_loads
 from remodel_fenicsx.evolution.coupling import CouplingFactory
-from remodel_fenicsx.evolution.stepper import FixedSteps, Step, Stepper, Watcher, Way
+from remodel_fenicsx.evolution.stepper import FixedSteps, Step, Stepper, TimeStepping, Watcher
 from remodel_fenicsx.fem.kinematics import NaturalConfiguration
 from remodel_fenicsx.initial import (
     field_from_files,
@@ -53,12 +53,13 @@ class Simulation:
     ----------
     domain, unknown, quadrature, cells, loading, state, tissue, stepper, observer
         Components of the simulation, each usable alone (see demos/).
-    way
-        Time stepping strategy: constant steps, adaptive steps if the scene has a tolerance, or
+    time_stepping
+        Time stepping: constant steps, adaptive steps if the scene has a tolerance, or
         steps to the steady state.
     watchers
         Watchers of the steps, in order: stability of equilibria, the observer, and those of
-        `extend.WATCHERS`. Their records belong to the state.
+        `extend.WATCHERS`. Numbers that they keep between steps belong to the state, so that a
+        resumed run has them too.
 
     Raises
     ------
@@ -90,14 +91,14 @@ class Simulation:
     ):
         if not isinstance(scene, Scene):
             raise TypeError(
-                f"not a Scene: {scene!r}; read_scene(PATH) makes one of a file, "
-                "preset_scene one of a preset"
+                f"not a Scene: {scene!r}; use read_scene(PATH) for a file, "
+                "preset_scene(PAPER, BODY) for a preset"
             )
         restore_signal_handlers()
         parts = build(scene, comm, domain, coupling)
         self.scene, self.domain = parts.scene, parts.domain
         self.stepper, self.observer = parts.stepper, parts.observer
-        self.state, self.way = self.stepper.state, parts.way
+        self.state, self.time_stepping = self.stepper.state, parts.time_stepping
         self.unknown, self.cells = self.state.unknown, self.state.cells
         self.loading = self.state.loading
         self.quadrature, self.tissue = self.cells.quadrature, self.stepper.tissue
@@ -119,7 +120,8 @@ class Simulation:
         """Solve and remodel from the present state, and yield each accepted step.
 
         The row and the fields belong to the solved state. With the couplings "staggered" and
-        "relaxed" the cells at a yield are one pass ahead of them (docs/theory.md, Couplings).
+        "relaxed", the cells have already made the next remodeling pass when a step is yielded
+        (docs/theory.md, Couplings).
 
         Parameters
         ----------
@@ -136,7 +138,7 @@ class Simulation:
         StepFailure
             If a step has no admissible equilibrium.
         """
-        return self.way.march([*self.watchers, *watchers])
+        return self.time_stepping.march([*self.watchers, *watchers])
 
     def close(self) -> None:
         """Free PETSc's objects and options."""
@@ -153,7 +155,7 @@ class SimulationParts:
     domain: Domain
     stepper: Stepper
     observer: Observer
-    way: Way  # `FixedSteps`, `StepControl` or `Homeostasis`
+    time_stepping: TimeStepping  # `FixedSteps`, `StepControl` or `Homeostasis`
 
 
 def build(
@@ -162,31 +164,35 @@ def build(
     domain: Domain | None = None,
     coupling: CouplingFactory | None = None,
 ) -> SimulationParts:
-    """Build the components of a scene in their order. Collective."""
+    """Build mesh, states, stepper and observer of a scene, in this order. Collective."""
     scene, domain = meshed(scene, comm, domain)
     fibres = measured_fibres(scene, domain)
-    state, *others = initial_states(scene, domain, fibres)
-    if others and coupling is not None:
+    state, *further_states = initial_states(scene, domain, fibres)
+    if further_states and coupling is not None:
         raise SceneError("cases: a custom coupling solves one load case; remove [[cases]]")
     tissue, kappa = parameters_of(scene.properties(), domain)
-    solver, (first, *more) = _solver(scene), (
-        partial(values_of_loads, case.loads) for case in scene.each_case()
-    )
-    stepper = Stepper(state, tissue, _remodeling(scene, comm), solver, first, coupling, kappa)
+    solver = _solver(scene)
+    loads, *further_loads = (partial(values_of_loads, case.loads) for case in scene.each_case())
+    stepper = Stepper(state, tissue, _remodeling(scene, comm), solver, loads, coupling, kappa)
     for process in stepper.remodels:
         process.set_initial(
             partial(field_from_files, fibres, quadrature=state.cells.quadrature, domain=domain)
         )
-    if others:
+    if further_states:
         from remodel_fenicsx.evolution import load_cases
 
-        load_cases.join(stepper, others, more, [case.weight for case in scene.cases], solver, kappa)
-    way = _way(scene, stepper)
+        weights = [case.weight for case in scene.cases]
+        load_cases.join(stepper, further_states, further_loads, weights, solver, kappa)
+    time_stepping = _time_stepping(scene, stepper)
     estimated = (
         [TIME_ERROR] if scene.time.is_adaptive and TIME_ERROR not in scene.output.columns else []
     )
     return SimulationParts(
-        scene, domain, stepper, Observer(scene.geometry, stepper, scene.columns(estimated)), way
+        scene,
+        domain,
+        stepper,
+        Observer(scene.geometry, stepper, scene.columns(estimated)),
+        time_stepping,
     )
 
 
@@ -201,15 +207,19 @@ def _solver(scene: Scene) -> Solver:
 
 def _remodeling(scene: Scene, comm: MPI.Intracomm) -> Remodeling:
     """Return the remodeling settings; the path to a steady state with random cells is relaxed."""
-    # No step is small enough to resolve changes of order of random cells, and passes oscillate.
+    # When the principal values of random cells change their rank, the cells jump at any step size,
+    # and the passes oscillate.
     if not (scene.time.is_equilibrium and scene.has_random_cells and scene.has_order_jumps):
         return scene.remodeling
     if comm.rank == 0:
-        log.info("the path to the equilibrium takes the coupling 'relaxed': random cells oscillate")
+        log.info(
+            "the path to the equilibrium uses the coupling 'relaxed', because random cells would "
+            "otherwise oscillate"
+        )
     return scene.remodeling.model_copy(update={"coupling": "relaxed"})
 
 
-def _way(scene: Scene, stepper: Stepper) -> Way:
+def _time_stepping(scene: Scene, stepper: Stepper) -> TimeStepping:
     """Return the time stepping: constant steps, adaptive steps, or steps to the steady state."""
     time, stops = scene.time, scene.stops()
     if not (time.is_equilibrium or time.is_adaptive or TIME_ERROR in scene.output.columns):
@@ -226,8 +236,8 @@ def _way(scene: Scene, stepper: Stepper) -> Way:
     tolerance = time.tolerance or (homeostasis.UNLOADING if falls else homeostasis.PATH_TOLERANCE)
     if scene.has_random_cells and scene.has_order_jumps:
         tolerance = homeostasis.NO_ERROR_CONTROL
-    held_from, before = max(stops[:-1], default=0.0), scene.hold_before_change
-    plan = homeostasis.PathToRest(scene.last_time, stops, time.step, tolerance, held_from, before)
+    held_from, hold = max(stops[:-1], default=0.0), scene.hold_before_change
+    plan = homeostasis.PathToRest(scene.last_time, stops, time.step, tolerance, held_from, hold)
     return homeostasis.Homeostasis(stepper, plan)
 
 
@@ -246,7 +256,9 @@ def watchers(scene: Scene, parts: SimulationParts) -> list[Watcher]:
     for case in stepper.each_case[1:]:
         case_watchers: list[Watcher | None] = [EquilibriumStability(case, unstable)]
         case_watchers += [kind.make(scene, case) for kind in WATCHERS.values() if kind.each_case]
-        candidates += [case.watched(watcher) for watcher in case_watchers if watcher is not None]
+        candidates += [
+            case.adapt_watcher(watcher) for watcher in case_watchers if watcher is not None
+        ]
     return [watcher for watcher in candidates if watcher is not None]
 
 
@@ -257,11 +269,12 @@ def reset_simulation(simulation: Simulation, start: Snapshot, scene: Scene) -> b
     stepper, kinematics = simulation.stepper, simulation.state.kinematics
     parameters = stepper.tissue.parameters
     varies = {name: isinstance(value, Function) for name, value in tissue.parameters.items()}
-    # Adaptive time stepping, growth and the stability check hold numbers of the scene.
-    chosen = not isinstance(simulation.way, FixedSteps)
-    watched = chosen or kinematics.grows or scene.solver.unstable == "stop"
+    # Adaptive time stepping, growth and the stability check keep copies of scene values, which a
+    # reset would not update.
+    has_variable_steps = not isinstance(simulation.time_stepping, FixedSteps)
+    must_rebuild = has_variable_steps or kinematics.grows or scene.solver.unstable == "stop"
     if (
-        watched
+        must_rebuild
         or parameters.keys() != varies.keys()
         or any(varies[name] and not isinstance(parameters[name], Function) for name in varies)
     ):
@@ -273,7 +286,7 @@ def reset_simulation(simulation: Simulation, start: Snapshot, scene: Scene) -> b
             else parameters[name].value
         )
         numbers[...] = value.x.array if varies[name] else value
-    stepper.take(partial(values_of_loads, scene.loads), kappa)
+    stepper.replace_loads_and_kappa(partial(values_of_loads, scene.loads), kappa)
     simulation.state.restore(start)
     if isinstance(kinematics, NaturalConfiguration) and not scene.natural.fibres:
         cells, quadrature = simulation.cells, simulation.quadrature

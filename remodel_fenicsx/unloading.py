@@ -370,7 +370,7 @@ def _missed(simulation: Simulation, given: Array, share: float) -> Array:
     unknown.x.array.reshape(-1, 3)[dofs] = given[domain.node_number] - domain.mesh.geometry.x
     if not coupling.equilibrium.extension().admissible:
         raise ArithmeticError("no admissible state on the path: r >= L or J <= 0")
-    change = coupling.newton.answer(coupling.equilibrium, 0)
+    change = coupling.newton.newton_correction(coupling.equilibrium, 0)
     distances: Array = domain.comm.bcast(domain.gather_nodes(-change.reshape(-1, 3)[dofs]))
     if not np.isfinite(distances).all():
         raise ArithmeticError("the tangent is singular")

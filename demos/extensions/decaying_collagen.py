@@ -29,7 +29,7 @@ class Decay(Table):
 
 
 class DecayingContent(Remodels):
-    """Gives the tissue the content of the time of each equilibrium."""
+    """Content of the chains, which decays at a constant rate."""
 
     name, changes = "decay", True
 
@@ -45,18 +45,18 @@ class DecayingContent(Remodels):
         self.tissue = replace(tissue, content=self.content)
 
     def before(self, time, order):
-        """Take the content at the end of the step."""
+        """Set the content at the end of the step."""
         self.last, self.next = (
             math.exp(-self.fastest * moment) for moment in (self.state.time, time)
         )
         self.set_part(1.0)
 
     def set_part(self, fraction):
-        """Take a part of the loss of the step."""
+        """Apply a fraction of the loss of the step."""
         self.content.x.array[:] = self.last + fraction * (self.next - self.last)
 
-    def left(self, time, residual):
-        """Return the relative loss up to a time."""
+    def remaining_change(self, time, residual):
+        """Return the relative loss that remains up to a time."""
         return 1.0 - math.exp(-self.fastest * (time - self.state.time))
 
     def without_rest(self, waiting):

@@ -301,7 +301,15 @@ ELASTIN = {
 }
 """Variants of the preset `carotid`. The exponent of each driver is that with which it fares better."""
 RELEASED = ("opening_angle", "axial_stretch_in_vivo")
-MEASURED = ["measured", "16.7, even", "above 0", "0.8 to 1.2", "1.5, 1.0", "60 to 120 and more", "1.3 to 1.6"]
+MEASURED = [
+    "measured",
+    "16.7, even",
+    "above 0",
+    "0.8 to 1.2",
+    "1.5, 1.0",
+    "60 to 120 and more",
+    "1.3 to 1.6",
+]
 
 
 def elastin(label: str) -> Row:

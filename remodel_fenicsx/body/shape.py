@@ -234,7 +234,7 @@ def _turnover_warnings(name: str, unit: str, meaning: str, value: Callable[[Any]
         name,
         unit,
         meaning,
-        lambda m: float(value(m.observer.stepper.part("turnover"))),
+        lambda m: float(value(m.observer.stepper.process("turnover"))),
         by_case=False,
     )
 
@@ -284,7 +284,7 @@ COLUMNS_ON_REQUEST: dict[str, Column] = {
             "growth",
             "",
             "stress-free volume of the tissue over its initial value; mean over the initial volume",
-            lambda m: m.quadrature.mean(m.observer.stepper.part("turnover").growth.ratio),
+            lambda m: m.quadrature.mean(m.observer.stepper.process("turnover").growth.ratio),
             by_case=False,
         ),
         _turnover_warnings(

@@ -32,11 +32,12 @@ log = logging.getLogger(__name__)
 # Record of a target at one point.
 TARGET = np.dtype([("direction", float, (3, 3)), ("switch", float), ("time", float)])
 NO_TIME = -1.0  # time of a target before the first one
-# Smallest switch of a target that counts. The cells change less by a smaller one than by a step's
-# error.
+# Targets with a switch below this are ignored: they change the cells by less than the time error
+# of a step.
 MIN_TARGET_WEIGHT = 0.01
-# Number of rates that predict the next one, and number of rates to which the weights are fitted.
-ORDER, FITTED = 3, 2
+# Number of rates in the weighted sum that predicts the next rate, and number of known rates to
+# which its weights are fitted.
+SUMMED, FITTED = 3, 2
 SAME_RATE = 1e-9  # relative tolerance of equal load rates
 INDEPENDENT = 1e-12  # relative singular value below which rates depend on each other up to rounding
 
@@ -61,43 +62,49 @@ class LoadStep(NamedTuple):
 
 
 class Predictor:
-    """Linear prediction of rates, v_n = sum_j a_j v_(n-j), if the load rates stay."""
+    """Prediction of the unknowns by the rates of earlier steps, v_n = sum_j a_j v_(n-j)."""
+
+    # It needs load rates that are the same as in the earlier steps.
 
     def __init__(self, state: State):
         self.state = state
         # Rates are increments over the duration of their steps, so that the step size may change.
-        self._speeds = FieldHistory(state, "predictor_speed", state.unknown.copy, ORDER + FITTED)
+        self._speeds = FieldHistory(state, "predictor_speed", state.unknown.copy, SUMMED + FITTED)
         self._numbers = StateNumbers(
             state, "predictor", {f"rate_{name}": 0.0 for name in state.loading.values}
         )
 
     def expected(self, step: LoadStep) -> Array | None:
-        """Return predicted unknowns with boundary values, ghosts included; None if unknown."""
+        """Return the prediction with boundary values and ghosts; None without earlier rates."""
         speeds, state = self._speeds.values, self.state
-        if not speeds or not self._goes_on(step):
+        if not speeds or not self._has_same_load_rates(step):
             return None
         speed = speeds[0]
-        if len(speeds) == ORDER + FITTED:
-            speed = self._weights(speeds) @ np.array(speeds[:ORDER])
+        if len(speeds) == SUMMED + FITTED:
+            speed = self._weights(speeds) @ np.array(speeds[:SUMMED])
         values: Array = state.unknown.x.array + step.duration * speed
         for condition in state.loading.boundary_conditions:
             condition.set(values)
         return values
 
     def solved(self, step: LoadStep, before: Array, again: bool = False) -> None:
-        """Record the rate of a solved step from the unknowns before it, or of its first solve."""
+        """Record the rate of a solved step.
+
+        `before`: unknowns before the step. With `again`: unknowns after its first solve, and the
+        rate is added.
+        """
         unknown = self.state.unknown
         speed = np.asarray((unknown.x.array - before) / step.duration, dtype=np.float64)
         if again:
             self._speeds.values[0][:] += speed
             return
-        if not self._goes_on(step):
+        if not self._has_same_load_rates(step):
             self._speeds.forget()
         self._speeds.push(speed)
         for name, rate in step.rates.items():
             self._numbers[f"rate_{name}"] = rate
 
-    def _goes_on(self, step: LoadStep) -> bool:
+    def _has_same_load_rates(self, step: LoadStep) -> bool:
         """Return whether the load rates are those of the last step."""
         rates = [(rate, self._numbers[f"rate_{name}"]) for name, rate in step.rates.items()]
         return all(
@@ -108,10 +115,10 @@ class Predictor:
         """Fit the newest rates by the rates before them, by least squares. Collective."""
         rows = np.array([speed[: self.state.number_of_owned_unknowns] for speed in speeds])
         products = allreduce(self.state.comm, rows @ rows.T, MPI.SUM)
-        matrix, right = np.zeros((ORDER, ORDER)), np.zeros(ORDER)
+        matrix, right = np.zeros((SUMMED, SUMMED)), np.zeros(SUMMED)
         for k in range(FITTED):
-            matrix += products[k + 1 : k + 1 + ORDER, k + 1 : k + 1 + ORDER]
-            right += products[k + 1 : k + 1 + ORDER, k]
+            matrix += products[k + 1 : k + 1 + SUMMED, k + 1 : k + 1 + SUMMED]
+            right += products[k + 1 : k + 1 + SUMMED, k]
         return np.asarray(np.linalg.lstsq(matrix, right, rcond=INDEPENDENT)[0], dtype=np.float64)
 
 
@@ -124,7 +131,8 @@ class Traits(NamedTuple):
     order
         Order of the error in the step size.
     accumulates
-        Whether the errors of steps accumulate; otherwise the row lags behind by a step.
+        Whether the errors of steps accumulate. Otherwise the error of a row is that its cells are
+        those of the step before.
     max_scaled_step
         Largest adaptive step times kappa; an explicit rule oscillates with larger steps.
 
@@ -141,17 +149,18 @@ class Traits(NamedTuple):
 
 
 class Coupling(Protocol):
-    """Protocol of a step in two halves, in the stepper's transaction; the row is in between.
+    """Protocol of a coupling.
 
-    `RemodelingPass.apply` and `replace` change the cells and compute the power. Values that carry
-    over from step to step belong to the state (`State.remember`, `state.Numbers`). The coupling
-    calls `before`, `settle` in equilibrium, and `after` of the remodeling processes in addition to
-    the cells (`RemodelingPass.beside`).
+    A step has two halves, `solve` and `remodel`; the output row is taken between them. Both run
+    inside the stepper's transaction. `RemodelingPass.apply` and `replace` change the cells and
+    compute the power. Values that carry over from step to step belong to the state
+    (`State.remember`, `state.StateNumbers`). For each process in `RemodelingPass.beside` the
+    coupling calls `before`, then `settle` once equilibrium is reached, then `after`.
 
     Attributes
     ----------
     equilibrium
-        Forms of the solved state, with its cells.
+        Forms of the forces, the tangent and the energy, at the unknowns and cells of the state.
     newton
         Newton's method for the state.
     traits
@@ -273,7 +282,7 @@ class Staggered:
             process.before(time, self.traits.order)
 
     def solve_equilibrium(self, time: float, loads: LoadValues, again: bool = False) -> Work:
-        """Solve for equilibrium with remodeled values; call `settle` of remodeling processes.
+        """Solve for equilibrium with the present cells, then call `settle` of further processes.
 
         Parameters
         ----------
@@ -359,7 +368,7 @@ class Staggered:
     def _starts_as_expected(self, step: LoadStep) -> bool:
         """Set the unknowns to the prediction, and return whether it exists and is admissible."""
         # If chains are almost straight in the prediction, the forces are huge, and Newton's method
-        # returns slowly. From the last displacement it then takes fewer iterations.
+        # needs many iterations. It needs fewer from the last displacement.
         expected = None if self.predictor is None else self.predictor.expected(step)
         if expected is None:
             return False
@@ -368,10 +377,10 @@ class Staggered:
         return self.newton.is_admissible_start(self._last["extension"])
 
     def _tried(
-        self, attempt: Attempt, work: Work, origin: Array | None = None
+        self, attempt: Attempt, work: Work, step_start: Array | None = None
     ) -> SolveFailure | None:
         """Solve from the present unknowns, and return the failure or None."""
-        outcome = attempted(lambda: self.newton.solve(origin), SolveFailure)
+        outcome = attempted(lambda: self.newton.solve(step_start), SolveFailure)
         work.add(outcome)
         if isinstance(outcome, SolveFailure):
             say(attempt, outcome.reason)
@@ -470,9 +479,10 @@ def between(old: LoadValues, new: LoadValues, fraction: float) -> LoadValues:
 
 
 class Extrapolated(Staggered):
-    """Second-order coupling: remodel with sE + h/2 d(sE)/dt from two targets, then solve."""
+    """Second-order coupling: remodel with an extrapolated target, then solve."""
 
-    # See docs/theory.md, Extrapolated coupling.
+    # The target sE (switch s, direction E) is extrapolated from the last two steps to the middle of
+    # the step of size h, sE + h/2 d(sE)/dt. See docs/theory.md, Extrapolated coupling.
 
     traits = Traits(order=2, accumulates=True, max_scaled_step=0.5)
 
@@ -491,32 +501,33 @@ class Extrapolated(Staggered):
         self._power = 0.0
         self._start: UnitCell  # the cells at the start of the step
         self._solved_target: Target  # target of the solved state
-        self._begins: Flags  # points with the first target in this step
+        self._has_first_target: Flags  # points whose first target appears in this step
         self._duration = 0.0  # duration of the step
 
     @property
     def higher_order_cells(self) -> UnitCell:
-        """Cells by the targets at both ends of the step, or only by the first target of a point."""
+        """Cells computed with a weighted mean of the targets at both ends of the step."""
+        # Points whose first target appears in this step use that target alone.
         weight = weight_of_the_end(self.remodeling.kappa * self._duration)
         mean = target_from_records(self._older).towards(self._solved_target, weight)
-        mean = mean.where(self._begins, self._solved_target)
+        mean = mean.where(self._has_first_target, self._solved_target)
         return self.remodeling.followed(mean, self._duration, self._start)
 
     def solve(self, time: float, loads: LoadValues) -> Work:
         """Compute the new cells, and solve for equilibrium at `time` with them."""
         cells = self.state.cells
         self._start, expected = cells.point_cells.copy(), self._extrapolated(time)
-        self._follow(expected, time)
+        self._set_cells_after(expected, time)
         self._before(time)
         work = self.solve_equilibrium(time, loads)
         self._solved_target = self.remodeling.target(self.residual)
-        self._begins = (self._newest["switch"] < MIN_TARGET_WEIGHT) & (
+        self._has_first_target = (self._newest["switch"] < MIN_TARGET_WEIGHT) & (
             self._solved_target.switch >= MIN_TARGET_WEIGHT
         )
-        if not count_points(self.state, self._begins):
+        if not count_points(self.state, self._has_first_target):
             return work
         cells.set(*self._start[:2])
-        self._follow(expected.where(self._begins, self._solved_target), time)
+        self._set_cells_after(expected.where(self._has_first_target, self._solved_target), time)
         repeated = self.solve_equilibrium(time, loads, again=True)
         self._solved_target = self.remodeling.target(self.residual)
         repeated.substeps += work.substeps - 1
@@ -527,7 +538,7 @@ class Extrapolated(Staggered):
         """Record the target of the solved state; the cells are already those of the row."""
         self._duration = time - self.state.time
         self._older[:] = self._newest
-        self._older["time"][self._begins] = NO_TIME  # this step used the target of its end
+        self._older["time"][self._has_first_target] = NO_TIME  # the target of its end was used
         self._newest["direction"], self._newest["switch"] = self._solved_target
         self._newest["time"] = time
         return self._power + self._after(time)
@@ -539,8 +550,8 @@ class Extrapolated(Staggered):
         weight[has_both] = (time - last[has_both]) / 2 / (last[has_both] - before[has_both])
         return target_from_records(self._newest).towards(target_from_records(self._older), -weight)
 
-    def _follow(self, target: Target, time: float) -> None:
-        """Compute the cells after the step; use the last target if A would become indefinite."""
+    def _set_cells_after(self, target: Target, time: float) -> None:
+        """Set the cells after the step; use the last target if A would become indefinite."""
         duration = time - self.state.time
         self._power = 0.0
         if not count_points(self.state, target.switch != 0.0):
@@ -553,7 +564,7 @@ class Extrapolated(Staggered):
             )
         points = count_points(self.state, lost)
         if points and self.state.comm.rank == 0:
-            log.info("time %g: %d points follow the last stress, not extrapolated", time, points)
+            log.info("time %g: %d points use the last target, without extrapolation", time, points)
         self._power = self.remodeling.replace(cells, self.state.elastic_gradient(), duration)
 
 

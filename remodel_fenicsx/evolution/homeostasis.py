@@ -97,7 +97,7 @@ class Homeostasis:
         """Yield the steady state as one committed step."""
         self.stepper.start(watchers)
         for time in self.remaining():
-            yield self.stepper.advance(time, watchers, is_last=True, strategy=self)
+            yield self.stepper.advance(time, watchers, is_last=True, coupling=self)
 
     def solve(self, time: float, loads: LoadValues) -> Work:
         """Solve for the equilibrium of forces and of cells."""
@@ -127,12 +127,12 @@ class Homeostasis:
         """Integrate to the steady state under constant loads, then start waiting processes."""
         stops = [*(stop for stop in self.plan.stops if stop <= held), self.plan.stops[-1]]
         control = self.control.with_stops(stops)
-        with self.stepper.holding(held):
+        with self.stepper.constant_loads_from(held):
             self._integrate(control, stops[-1], self.stepper.load_values(held), held, False, work)
         self.state.mark_cells_in_equilibrium()
         log.info("steady state reached after %d steps, before time %g", self.steps, change)
         for process in self.remodels:
-            process.rested(change)
+            process.start_at_rest(change)
         self.state.complete_step(change, self.state.number)
 
     def _integrate(
@@ -170,7 +170,7 @@ class Homeostasis:
             self._held = self._held or ahead
             # The cells of the present stress.
             state.cells.set(solved.dimension_values, solved.axis_values)
-            change, residual = self._left(work.residual), work.residual
+            change, residual = self._remaining_change(work.residual), work.residual
             # A step larger than 1/kappa counts as 1/kappa.
             waiting += min(1.0, self.stepper.slowest * (state.time - start))
             start = state.time
@@ -186,10 +186,10 @@ class Homeostasis:
                 longest, before = longer if change < before else MAX_STEP, change
                 control.limit(NO_ERROR_CONTROL, longest)
 
-    def _left(self, residual: float) -> float:
+    def _remaining_change(self, residual: float) -> float:
         """Return the largest relative change in a time of 1/kappa."""
         soon = self.state.time + 1 / self.stepper.slowest
-        return max(process.left(soon, residual) for process in self.stepper.remodels)
+        return max(process.remaining_change(soon, residual) for process in self.stepper.remodels)
 
     def _has_no_rest(self, change: float, waiting: float) -> bool:
         """Return whether the path ends without a steady state, and warn."""
@@ -212,14 +212,14 @@ class Homeostasis:
         # their change decreases.
         state, factor = self.state, 1.0
         coupling = self.stepper.coupling
-        changes = self._to_the_limit(time, work.residual)
+        changes = self._changes_to_limit(time, work.residual)
         for _ in range(TAIL_PASSES):
             size = self._size(changes)
             if size <= TAIL:
                 return True
             before, residual = state.snapshot(), work.residual
             for process, change in zip(self.remodels, changes, strict=True):
-                process.follow(change, factor, time, residual)
+                process.apply_change(change, factor, time, residual)
             soon = state.time + 1 / self.stepper.slowest
             solve = coupling.solve_equilibrium  # type: ignore[attr-defined]
             outcome = attempted(partial(solve, soon, loads, again=True), StepFailure)
@@ -229,7 +229,7 @@ class Homeostasis:
                 return False
             work.add(outcome)
             work.substeps, self.steps = work.substeps + outcome.substeps, self.steps + 1
-            earlier, changes = changes, self._to_the_limit(time, outcome.residual)
+            earlier, changes = changes, self._changes_to_limit(time, outcome.residual)
             if self._size(changes) >= size:
                 state.restore(before)
                 work.residual = residual
@@ -247,10 +247,10 @@ class Homeostasis:
             factor = 1 / (1 - min(max(ratio, -1.0), LARGEST_RATIO))
         return False
 
-    def _to_the_limit(self, time: float, residual: float) -> list[Array]:
+    def _changes_to_limit(self, time: float, residual: float) -> list[Array]:
         """Return the changes to the limit of all remodeling processes."""
         return [
-            process.to_the_limit(time, 1 / self.stepper.slowest, residual)
+            process.change_to_limit(time, 1 / self.stepper.slowest, residual)
             for process in self.remodels
         ]
 

@@ -24,16 +24,24 @@ Values: TypeAlias = Any  # type: ignore[explicit-any]
 class Remodels:
     """Base class of a remodeling process; a subclass overrides the methods that it needs.
 
-    Values are flattened over the quadrature points, with a type that the subclass defines. As
-    components they are an array (n, components) whose differences are meaningful.
+    A process has values at all n quadrature points of this rank, of a type that the subclass
+    defines. `as_components` returns them as an array (n, components) whose differences are
+    meaningful. A change by `change_to_limit` is an array (elements, points, ...), such as
+    (elements, points, 3, 3) for the cells.
+
+    With `changes` a subclass overrides `before` or `after`, `set_part` and `remaining_change`. For
+    an estimated time discretisation error it sets `components`, and overrides `row`,
+    `higher_order`, `set`, `as_components`, `with_change`, `after_pass` and `distance_between`
+    together. For a steady state with `components` it also overrides `change_to_limit`, `size` and
+    `apply_change`.
 
     Attributes
     ----------
     name
         Prefix of names in the state.
     components
-        Number of components at a point; 0 without values, for which neither a time discretisation
-        error is estimated nor the tail of the steady state extrapolated.
+        Number of components at a point. With 0 no time discretisation error is estimated, and the
+        path to the steady state is not extrapolated.
     changes
         Whether the values change in time.
     slowest, fastest
@@ -41,7 +49,7 @@ class Remodels:
     depends_on_path
         Whether the steady state depends on the load path.
     tissue
-        The tissue with additional parameters; None if it stays.
+        The tissue with additional parameters; None if the process adds no parameters.
     watchers
         Functions of a scene and a stepper that return a watcher or None.
 
@@ -70,18 +78,52 @@ class Remodels:
 
     # ------------------------------------------------------------ a step
     def before(self, time: float, order: int) -> None:
-        """Set the values for the equilibrium at a time, by the last rates or extrapolated."""
+        """Set the values for the equilibrium at the end of a step.
+
+        Parameters
+        ----------
+        time
+            End of the step.
+        order
+            Order of the coupling: for 1 the last rates apply to the step, for 2 rates that are
+            extrapolated to its middle.
+        """
 
     def settle(self, time: float, again: bool) -> Work:
-        """Update after a solved equilibrium; `again` if it is the second one of this step."""
+        """Update the values after a solved equilibrium, and return additional solver work.
+
+        Parameters
+        ----------
+        time
+            End of the step.
+        again
+            Whether it is the second equilibrium of this step.
+
+        Returns
+        -------
+        Work
+            Solver work of the process.
+        """
         return Work()
 
     def after(self, time: float) -> float:
-        """Remodel after a solved step, and return the released power."""
+        """Remodel after a solved step, and return the released power.
+
+        Parameters
+        ----------
+        time
+            End of the step.
+
+        Returns
+        -------
+        float
+            Stored energy per time that the process releases at frozen deformation; positive if the
+            stored energy decreases. It is added to the column `remodeling_power`.
+        """
         return 0.0
 
     def set_part(self, fraction: float) -> None:
-        """Apply a fraction of the change since the last equilibrium."""
+        """Set the values to a fraction, from 0 to 1, of their change since the last equilibrium."""
 
     def close(self) -> None:
         """Free the PETSc objects of the values."""
@@ -91,7 +133,7 @@ class Remodels:
         """Return the values of the solved state."""
 
     def higher_order(self) -> Values:
-        """Return the values of a higher-order rule after a step, or None."""
+        """Return the values of a higher-order rule after a step; None if there is no such rule."""
 
     def set(self, values: Values) -> None:
         """Replace the values at all points."""
@@ -100,40 +142,69 @@ class Remodels:
         """Return values as components, (n, components)."""
         return np.asarray(values)
 
-    def moved(self, values: Values, change: Array) -> Values:
-        """Return values after a change of their components."""
+    def with_change(self, values: Values, change: Array) -> Values:
+        """Return values after a change (n, components) of their components."""
         return values
 
-    def passed(self, values: Values, time: float, residual: float) -> Values:
-        """Return the values after a pass with the present state up to a time."""
+    def after_pass(self, values: Values, time: float, residual: float) -> Values:
+        """Return values after a pass up to a time, with the stress of the present state.
+
+        Parameters
+        ----------
+        values
+            Values at the state's time.
+        time
+            End of the pass.
+        residual
+            Residual norm with which the state was accepted.
+        """
         return values
 
-    def apart(self, values: Values, other: Values) -> float:
-        """Return the distance of two values over the body, in degrees."""
+    def distance_between(self, values: Values, other: Values) -> float:
+        """Return one number for the distance of two values over the body, in degrees."""
         return 0.0
 
     # ------------------------------------------------------------ steady state
-    def left(self, time: float, residual: float) -> float:
-        """Return the largest relative change up to a time. Every process needs it."""
+    def remaining_change(self, time: float, residual: float) -> float:
+        """Return the largest relative change that remains up to a time.
+
+        A process with `changes` must override it.
+        """
         return 0.0
 
-    def to_the_limit(self, time: float, duration: float, residual: float) -> Array:
-        """Return the change to the limit, or over a duration, (elements, points, ...)."""
+    def change_to_limit(self, time: float, duration: float, residual: float) -> Array:
+        """Return the change to the limit under the present stress, (elements, points, ...).
+
+        Parameters
+        ----------
+        time
+            End of a pass that is long enough to reach the limit.
+        duration
+            Duration of the change for a process that has rates but no pass to a limit.
+        residual
+            Residual norm with which the state was accepted.
+        """
         return np.zeros((0, 0))
 
     def size(self, change: Array) -> float:
         """Return the largest relative size of a change (elements, points, ...)."""
         return 0.0
 
-    def follow(self, change: Array, factor: float, time: float, residual: float) -> None:
-        """Apply a multiple of the change of `to_the_limit`."""
+    def apply_change(self, change: Array, factor: float, time: float, residual: float) -> None:
+        """Apply a multiple of the change of `change_to_limit`."""
 
     def begin_path(self) -> None:
         """Reset the monitors for a new path to the steady state."""
 
     def without_rest(self, waiting: float) -> str:
-        """Return why there is no steady state after a time under constant loads, or nothing."""
+        """Return why there is no steady state, or an empty string.
+
+        Parameters
+        ----------
+        waiting
+            Time under constant loads so far.
+        """
         return ""
 
-    def rested(self, time: float) -> None:
-        """Start at a time, if the process waits for the steady state."""
+    def start_at_rest(self, time: float) -> None:
+        """Start at a time if the process waits for a first steady state."""

@@ -51,7 +51,7 @@ class FurtherCase(LoadCaseSolver):
         """Return the drive of the solved state."""
         return self.remodeling.drive(self.coupling.residual)
 
-    def watched(self, watcher: Watcher) -> Watcher:
+    def adapt_watcher(self, watcher: Watcher) -> Watcher:
         return FurtherCaseWatcher(self, watcher)
 
     def seen(self, step: Step) -> Step:

@@ -36,15 +36,16 @@ from remodel_fenicsx.state import StateNumbers, State, stress_rounding
 log = logging.getLogger(__name__)
 Array = NDArray[np.float64]
 
-# Stress over the residual per area of the smallest face. An eighth of an element's nodes carry the
-# force of a face, and a pulled-back stress is larger still.
+# Bound of the stress error: this factor times residual / smallest face area. The residual is a
+# force at one node, an eighth of the nodes of an element, so its stress is up to 8 times the force
+# over the face area. A stress that is pulled back to the reference configuration is larger still.
 RESIDUAL_SHARE = 20.0
-# Largest noise from the residual, over the body's stress. Tension below it has no mechanical
-# weight.
+# The bound that the residual gives is limited to this fraction of the body's stress. A tension
+# below the fraction carries hardly any load, and may be treated as zero.
 TYPICAL_SHARE = 1e-2
-# Stress of the residual over the body's stress above which a warning is logged. For the artery on
-# one radius with the law "tensor", radii are within 0.1 % at 0.02 to 0.05; at 0.4 their error is 2
-# %.
+# A warning is logged if (stress of the residual) / (body's stress) exceeds this. Measured for the
+# artery on one radius with the law "tensor": ratio 0.02 to 0.05, error of radii below 0.1 %; ratio
+# 0.4, error 2 %.
 WARNED_RESIDUAL_FRACTION = 0.1
 STRESS_ROUNDINGS = 64.0  # error of a principal value over the rounding of a stress
 MIN_ACTIVATION = 0.5  # switch below which a point counts as a point without tension
@@ -94,7 +95,8 @@ class RemodelingPass(Remodels):
             self.law = LAWS["none"]
         if not self.law.remodels:
             return
-        self._change: tuple[UnitCell, UnitCell] | None = None
+        # Cells before the last pass, and after it without relaxation.
+        self._last_pass: tuple[UnitCell, UnitCell] | None = None
         self.kernels = state.cells.kernels
         self._numbers = StateNumbers(state, "noise", {"said": 0, "stress": 0.0, "floor": 0.0})
         self._smallest_area = self.quadrature.minimum(self.quadrature.smallest_areas)
@@ -114,7 +116,7 @@ class RemodelingPass(Remodels):
 
     @property
     def depends_on_path(self) -> bool:  # type: ignore[override]
-        """Whether cells with a tension below a threshold stay unchanged."""
+        """Whether the law has a threshold, below which a tension does not change the cells."""
         return self.settings.threshold > 0.0
 
     def set_kappa(self, kappa: float | Function) -> None:
@@ -152,7 +154,7 @@ class RemodelingPass(Remodels):
         F, tensor = self.driving_tensor()
         noise, rounding = self.noise(F, tensor, residual)
         cells = self.state.cells
-        # Principal axes of the driver for which the cells' axes would stay.
+        # If the principal axes of the driver are these, the axes of the cells do not change.
         steady = cells.point_cells.axes
         if not self.driver.material and self.frame.carries_axes:
             steady = convected_axes(F, steady)
@@ -207,8 +209,9 @@ class RemodelingPass(Remodels):
         return noise
 
     def relative_switch_threshold(self) -> float:
-        """Return the half-weight tension over the body's largest stress so far; 0 without loads."""
-        # Laws with a target remodel more slowly below this tension (`tensor_law.switch_threshold`).
+        """Return the switch threshold over the body's largest stress so far; 0 without loads."""
+        # Laws with a target remodel at half speed at this tension, and more slowly below it
+        # (`tensor_law.switch_threshold`).
         if not self.law.remodels or self.law.target is None or not self.driver.is_stress:
             return 0.0
         stress, floor = self._numbers["stress"], self._numbers["floor"]
@@ -271,7 +274,7 @@ class RemodelingPass(Remodels):
     @property
     def full_pass_cells(self) -> UnitCell | None:
         """Cells of the last pass before relaxation; None before the first pass."""
-        return self._change[1] if self.law.remodels and self._change is not None else None
+        return self._last_pass[1] if self.law.remodels and self._last_pass is not None else None
 
     def apply(self, time_old: float, time_new: float, residual: float = 0.0) -> float:
         """Remodel over a step with the stress of the solved state at time_new; return the power."""
@@ -284,9 +287,9 @@ class RemodelingPass(Remodels):
     def replace(self, full_pass: UnitCell, F: Array, duration: float, factor: float = 1.0) -> float:
         """Replace the cells with a relaxation factor; return the power at frozen F."""
         cells = self.state.cells
-        self._change = cells.point_cells.copy(), full_pass
-        updated = self.law.relax(self._change[0], full_pass, factor)
-        increment = self.parameters.at_points().energy_increment(F, self._change[0], updated)
+        self._last_pass = cells.point_cells.copy(), full_pass
+        updated = self.law.relax(self._last_pass[0], full_pass, factor)
+        increment = self.parameters.at_points().energy_increment(F, self._last_pass[0], updated)
         power: float = (
             0.0 - self.quadrature.integral(self.state.per_mesh_volume(increment)) / duration
         )
@@ -294,20 +297,20 @@ class RemodelingPass(Remodels):
         return power
 
     def predict_limit(self, time: float, residual: float = 0.0) -> None:
-        """Record the cells of a pass to the limit for `distance`; the state does not change."""
-        # The time of the steady state is so late that the start has decayed (`Scene.last_time`). A
-        # pass to twice that time leads to the limit.
+        """Store the cells that a pass to t -> infinity would give; `distance` uses them."""
+        # The state does not change. `time` is so long that the initial cells no longer matter
+        # (`Scene.last_time`); a pass up to 2 time therefore reaches the limit.
         full_pass, _ = self.updated_cells(time, 2 * time, residual)
         cells = self.state.cells
-        self._change = cells.point_cells.copy(), full_pass
+        self._last_pass = cells.point_cells.copy(), full_pass
 
     def distance(self) -> float:
         """Return max |A_pass - A| of the last pass, in squared link lengths."""
-        # A belongs to the solved state. It is the distance to a state whose cells belong to their
-        # own stress. NaN before the first pass.
-        if not self.law.remodels or self._change is None:
+        # A belongs to the solved state. The distance is zero if a pass reproduces the cells, that
+        # is, if they are in equilibrium with their own stress. NaN before the first pass.
+        if not self.law.remodels or self._last_pass is None:
             return float("nan")
-        before, after = (structure_tensor(*cells[:2]) for cells in self._change)
+        before, after = (structure_tensor(*cells[:2]) for cells in self._last_pass)
         distance = np.linalg.norm(after - before, axis=(-1, -2))
         return self.quadrature.maximum(distance.reshape(self.quadrature.shape))
 
@@ -324,14 +327,14 @@ class RemodelingPass(Remodels):
         """Return the Mandel components of A, (n, 6)."""
         return tensors.to_mandel(structure_tensor(*values[:2]))
 
-    def moved(self, values: UnitCell, change: Array) -> UnitCell:
+    def with_change(self, values: UnitCell, change: Array) -> UnitCell:
         """Return cells after a change of A, in Mandel components."""
         squared, axes = spectral.principal_by_continuity(
             structure_tensor(*values[:2]) + tensors.from_mandel(change), values.axes
         )
         return UnitCell(np.sqrt(np.maximum(squared, 0.0)), axes)
 
-    def passed(self, values: UnitCell, time: float, residual: float) -> UnitCell:
+    def after_pass(self, values: UnitCell, time: float, residual: float) -> UnitCell:
         """Return cells after a pass up to a time."""
         return (
             self.updated_cells(self.state.time, time, residual, values)[0]
@@ -339,16 +342,16 @@ class RemodelingPass(Remodels):
             else values
         )
 
-    def apart(self, values: UnitCell, other: UnitCell) -> float:
+    def distance_between(self, values: UnitCell, other: UnitCell) -> float:
         """Return the RMS of the angle between chain directions over the body, in degrees."""
         angles = angle_between(values, other).reshape(self.quadrature.shape)
         return float(np.sqrt(self.quadrature.mean(angles**2)))
 
-    def left(self, time: float, residual: float) -> float:
+    def remaining_change(self, time: float, residual: float) -> float:
         """Return the largest change of A by a pass, over r0^2."""
         return self.size(self._change_by_a_pass(time, residual))
 
-    def to_the_limit(self, time: float, duration: float, residual: float) -> Array:
+    def change_to_limit(self, time: float, duration: float, residual: float) -> Array:
         """Return the change of A by a pass up to a time, zero at points without tension."""
         change = self._change_by_a_pass(time, residual)
         change[self.without_tension(residual).reshape(self.quadrature.shape)] = 0.0
@@ -359,7 +362,7 @@ class RemodelingPass(Remodels):
         r0 = self.parameters.at_points().end_to_end_length.reshape(self.quadrature.shape)
         return self.quadrature.maximum(np.linalg.norm(change, axis=(-1, -2)) / r0**2)
 
-    def follow(self, change: Array, factor: float, time: float, residual: float) -> None:
+    def apply_change(self, change: Array, factor: float, time: float, residual: float) -> None:
         """Apply a multiple of the change of a pass up to a time."""
         remodeled, _ = self.updated_cells(self.state.time, time, residual)
         cells = self.state.cells

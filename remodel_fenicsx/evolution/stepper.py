@@ -44,7 +44,7 @@ CHECK_INTERVAL = (
 @with_old_names
 @dataclass
 class Step:
-    """Step, from its solution to its end.
+    """Record of a time step, which is filled from the solution to the end of the step.
 
     Attributes
     ----------
@@ -53,7 +53,8 @@ class Step:
     loads
         Magnitudes of the loads by name.
     extension
-        Largest r/L and smallest J of the solved state.
+        Limits of the solved state: the largest chain extension r/L (`max_chain_extension`) and the
+        smallest volume ratio J (`min_jacobian`).
     work
         Solver work.
     remodeling_power
@@ -105,7 +106,7 @@ class Step:
 
     @property
     def is_due(self) -> bool:
-        """Whether slow changes are checked: in the first, the last, and every fifth step."""
+        """Whether watchers check slow changes here: in the first, last, and every fifth step."""
         return self.is_last or self.number % CHECK_INTERVAL == 1
 
     @property
@@ -123,16 +124,16 @@ class Watcher:
     Examples
     --------
     >>> from remodel_fenicsx import Simulation, parts, preset_scene
-    >>> class Loudest(parts.Watcher):
-    ...     found = 0.0
+    >>> class LargestExtension(parts.Watcher):
+    ...     value = 0.0
     ...
     ...     def committed(self, step):
-    ...         self.found = max(self.found, step.extension.max_chain_extension)
+    ...         self.value = max(self.value, step.extension.max_chain_extension)
     >>> scene = preset_scene("kuhl-holzapfel-2007", "cube").with_values({"time.end": 3.0})
-    >>> watcher = Loudest()
+    >>> watcher = LargestExtension()
     >>> for step in Simulation(scene).steps([watcher]):
     ...     pass
-    >>> round(watcher.found, 4)
+    >>> round(watcher.value, 4)
     0.486
     """
 
@@ -276,7 +277,7 @@ class WarnsOnce(Watcher):
 
 
 class LoadCaseSolver:
-    """State with its solver: that of a stepper, or of a further load case with the same cells.
+    """State with its solver; a stepper, or a further load case that has the same cells.
 
     Attributes
     ----------
@@ -285,7 +286,7 @@ class LoadCaseSolver:
     load_values
         Function of time that returns the magnitudes of all loads by name.
     each_case
-        This load case and further load cases.
+        This load case and all further ones.
     """
 
     state: State
@@ -295,8 +296,8 @@ class LoadCaseSolver:
     load_values: Callable[[float], LoadValues]
     each_case: list[LoadCaseSolver]
 
-    def watched(self, watcher: Watcher) -> Watcher:
-        """Return a watcher of the stepper that gets each step with the values of this load case."""
+    def adapt_watcher(self, watcher: Watcher) -> Watcher:
+        """Return a watcher of the stepper that passes on each step as that of this load case."""
         return watcher
 
 
@@ -344,20 +345,20 @@ class Stepper(LoadCaseSolver):
     ):
         self.state, self._solver = state, solver
         self.load_values = load_values
-        beside: list[Remodels] = []
+        processes: list[Remodels] = []  # in addition to the cells
         for kind in remodeling.beside:
-            beside.append(kind.make(state, tissue, remodeling))
-            tissue = beside[-1].tissue or tissue
+            processes.append(kind.make(state, tissue, remodeling))
+            tissue = processes[-1].tissue or tissue
         self.tissue = state.parameters(tissue).tissue
-        self.remodeling = RemodelingPass(state, self.tissue, remodeling, kappa, beside)
+        self.remodeling = RemodelingPass(state, self.tissue, remodeling, kappa, processes)
         self.each_case = [self]
         # Cells that never change need no coupling.
         name = remodeling.coupling if self.remodeling.law.remodels else "staggered"
-        if beside and name != remodeling.coupling and state.comm.rank == 0:
+        if processes and name != remodeling.coupling and state.comm.rank == 0:
             log.warning(
                 "kappa is 0: the cells do not change; %s uses the coupling 'staggered' in place of "
                 "%r, with an error of first order in the step size",
-                ", ".join(process.name for process in beside),
+                ", ".join(process.name for process in processes),
                 remodeling.coupling,
             )
         make = coupling or COUPLINGS[name].make
@@ -369,7 +370,7 @@ class Stepper(LoadCaseSolver):
         """Remodeling processes: the cells first, then `RemodelingPass.beside`."""
         return [self.remodeling, *self.remodeling.beside]
 
-    def part(self, name: str) -> Any:  # type: ignore[explicit-any]  # the name tells the class
+    def process(self, name: str) -> Any:  # type: ignore[explicit-any]  # the name tells the class
         """Return the remodeling process of this name, or None.
 
         Parameters
@@ -381,17 +382,19 @@ class Stepper(LoadCaseSolver):
 
     @property
     def slowest(self) -> float:
-        """Smallest positive rate, 1/time; 0 if nothing remodels."""
+        """Smallest positive rate of all remodeling processes, 1/time; 0 if nothing remodels."""
         rates = (process.slowest for process in self.remodels if process.changes)
         return min(filter(None, rates), default=0.0)
 
     @property
     def fastest(self) -> float:
-        """Largest rate, 1/time; 0 if nothing remodels."""
+        """Largest rate of all remodeling processes, 1/time; 0 if nothing remodels."""
         return max((process.fastest for process in self.remodels if process.changes), default=0.0)
 
     def start(self, watchers: Sequence[Watcher] = ()) -> Step:
-        """Pass the present state to watchers as a step; at first solve for unloaded equilibrium.
+        """Pass the present state to watchers as a step.
+
+        A new state is first solved for the equilibrium of the unloaded body.
 
         Parameters
         ----------
@@ -406,7 +409,7 @@ class Stepper(LoadCaseSolver):
         state, work = self.state, Work()
         if not state.number:
             for case in self.each_case:
-                release(case.state, case.coupling.equilibrium, self._solver, work)
+                equilibrate_prestretch(case.state, case.coupling.equilibrium, self._solver, work)
         step = Step(
             state.time,
             state.number,
@@ -427,8 +430,8 @@ class Stepper(LoadCaseSolver):
         watchers: Sequence[Watcher] = (),
         is_last: bool = False,
         rejected: Step | None = None,
-        strategy: Homeostasis | None = None,
-        control_error: Callable[[Step], object] = lambda step: None,
+        coupling: Homeostasis | None = None,
+        measure_error: Callable[[Step], object] = lambda step: None,
     ) -> Step:
         """Advance by one step: equilibrium with the loads of `time`, and remodeling.
 
@@ -441,11 +444,12 @@ class Stepper(LoadCaseSolver):
         rejected
             Last rejected attempt at the step. Its work and seconds, which contain those of earlier
             attempts, are added to the step's.
-        strategy
-            Strategy that solves and remodels in place of the coupling (`homeostasis.Homeostasis`).
-        control_error
-            Function that is called after the pass; if it raises, the step is rejected
-            (`time_steps`).
+        coupling
+            Object that solves and remodels in place of the stepper's coupling
+            (`homeostasis.Homeostasis`).
+        measure_error
+            Function that is called after the pass to measure the time error. It may raise to reject
+            the step (`time_steps`).
 
         Returns
         -------
@@ -472,22 +476,22 @@ class Stepper(LoadCaseSolver):
                 f"time {time!r} does not come after {state.time!r}, that of the last step"
             )
         with state.transaction():
-            work = (strategy or self.coupling).solve(time, self.load_values(time))
+            work = (coupling or self.coupling).solve(time, self.load_values(time))
             extension = work.extension or self.coupling.equilibrium.extension()
             if rejected is not None:
                 work.add(rejected.work)
-            loads = dict(state.loading.values)  # also loads without a specified value
+            loads = dict(state.loading.values)  # also loads that `load_values` leaves unchanged
             step = Step(time, state.number + 1, loads, extension, work, is_last=is_last)
             with notify_undone(watchers, step):
                 for watcher in watchers:
                     watcher.solved(step)
-                step.remodeling_power = (strategy or self.coupling).remodel(time)
+                step.remodeling_power = (coupling or self.coupling).remodel(time)
                 step.seconds = clock.perf_counter() - start
                 step.processor_seconds = clock.process_time() - processor_start
                 if rejected is not None:
                     step.seconds += rejected.seconds
                     step.processor_seconds += rejected.processor_seconds
-                control_error(step)
+                measure_error(step)
                 state.complete_step(time, step.number)
                 for watcher in watchers:
                     watcher.completed(step)
@@ -502,7 +506,7 @@ class Stepper(LoadCaseSolver):
         self,
         times: Iterable[float],
         watchers: Sequence[Watcher] = (),
-        control_error: Callable[[Step], object] = lambda step: None,
+        measure_error: Callable[[Step], object] = lambda step: None,
     ) -> Iterator[Step]:
         """Start, and yield each committed step up to the end of `times`.
 
@@ -512,7 +516,7 @@ class Stepper(LoadCaseSolver):
             Times of the steps, ascending.
         watchers
             Watchers of the steps.
-        control_error
+        measure_error
             See `advance`.
 
         Yields
@@ -524,10 +528,12 @@ class Stepper(LoadCaseSolver):
         self.start(watchers)
         for number, time in enumerate(remaining, start=1):
             yield self.advance(
-                time, watchers, is_last=number == len(remaining), control_error=control_error
+                time, watchers, is_last=number == len(remaining), measure_error=measure_error
             )
 
-    def take(self, load_values: Callable[[float], LoadValues], kappa: float | Function) -> None:
+    def replace_loads_and_kappa(
+        self, load_values: Callable[[float], LoadValues], kappa: float | Function
+    ) -> None:
         """Replace the loads and the rate kappa.
 
         Parameters
@@ -539,16 +545,16 @@ class Stepper(LoadCaseSolver):
         self.remodeling.set_kappa(kappa)
 
     @contextmanager
-    def holding(self, held: float) -> Iterator[None]:
+    def constant_loads_from(self, start: float) -> Iterator[None]:
         """Keep all loads constant from a time on while the block runs.
 
         Parameters
         ----------
-        held
-            The time.
+        start
+            Time from which the loads are constant.
         """
         load_values = self.load_values
-        self.load_values = lambda time: load_values(min(time, held))
+        self.load_values = lambda time: load_values(min(time, start))
         try:
             yield
         finally:
@@ -560,8 +566,8 @@ class Stepper(LoadCaseSolver):
         self.coupling.close()
 
 
-class Way(Protocol):
-    """Protocol of a time stepping strategy."""
+class TimeStepping(Protocol):
+    """Protocol of time stepping: constant or adaptive steps, or steps to the steady state."""
 
     def remaining(self) -> list[float]:
         """Return the times of the remaining steps, as far as they are known."""
@@ -578,9 +584,9 @@ class FixedSteps:
         stepper: Stepper,
         end: float,
         step: float,
-        control_error: Callable[[Step], object] = lambda step: None,
+        measure_error: Callable[[Step], object] = lambda step: None,
     ):
-        self.stepper, self.control_error = stepper, control_error
+        self.stepper, self.measure_error = stepper, measure_error
         self.end, self.step = end, step
 
     def remaining(self) -> list[float]:
@@ -589,10 +595,12 @@ class FixedSteps:
 
     def march(self, watchers: Sequence[Watcher] = ()) -> Iterator[Step]:
         """Yield the committed steps from the present state to the end."""
-        return self.stepper.march(self.remaining(), watchers, self.control_error)
+        return self.stepper.march(self.remaining(), watchers, self.measure_error)
 
 
-def release(state: State, equilibrium: Equilibrium, settings: Solver, work: Work) -> None:
+def equilibrate_prestretch(
+    state: State, equilibrium: Equilibrium, settings: Solver, work: Work
+) -> None:
     """Equilibrate a body with prestretch, in substeps as needed. Collective."""
     G, identity = state.natural_gradient, np.eye(3)
     if (

@@ -104,7 +104,7 @@ class TimeError:
             if admissible:
                 pairs = zip(self.remodels, rows, strict=True)
                 betters = [
-                    process.passed(row, step.time, step.work.residual) for process, row in pairs
+                    process.after_pass(row, step.time, step.work.residual) for process, row in pairs
                 ]
         limit, angle = SLOWEST * angle, self._distance(rows, betters)
         if angle > limit:  # the pass leads to another state, to which this state does not tend
@@ -123,7 +123,7 @@ class TimeError:
             self.remodels, self._last, rows, strict=True
         )
         return [
-            process.moved(row, ratio * last.values[0].reshape(-1, process.components))
+            process.with_change(row, ratio * last.values[0].reshape(-1, process.components))
             for process, last, row in processes
         ]
 
@@ -143,7 +143,8 @@ class TimeError:
             self.remodels, self._errors, rows, _known(betters, rows), strict=True
         ):
             error = max(
-                process.apart(row, better), strain if process is self.stepper.remodeling else 0.0
+                process.distance_between(row, better),
+                strain if process is self.stepper.remodeling else 0.0,
             )
             # Bounded rates do not change for longer than the cells do.
             limits.append(_accumulated_error(error, max(self.kappa, process.slowest) * duration))
@@ -209,7 +210,7 @@ class TimeError:
     def _distance(self, rows: AllValues, betters: AllValues) -> float:
         """Return the largest distance over all remodeling processes, in degrees."""
         return max(
-            process.apart(*pair)
+            process.distance_between(*pair)
             for process, *pair in zip(self.remodels, rows, betters, strict=True)
         )
 
@@ -230,7 +231,7 @@ class TimeError:
     def _answered(self, case: LoadCaseSolver, before: Array, tangents: int) -> tuple[float, bool]:
         """Return length change and admissibility of one load case; `before` is its earlier F_e."""
         state, equilibrium = case.state, case.coupling.equilibrium
-        state.unknown.x.array[:] += case.coupling.newton.answer(equilibrium, tangents)
+        state.unknown.x.array[:] += case.coupling.newton.newton_correction(equilibrium, tangents)
         after, admissible = state.elastic_gradient(), equilibrium.extension().admissible
         changes = np.minimum(max_stretch_increment(before, after), LARGEST_LINEAR_CHANGE)
         changes = changes.reshape(self.quadrature.shape)
@@ -335,7 +336,7 @@ class StepControl:
                 watchers,
                 time == self.stops[-1],
                 before,
-                control_error=self._accept_or_reject,
+                measure_error=self._accept_or_reject,
             )
             outcome = attempted(advance, StepFailure, StepRejectedError)
             if isinstance(outcome, Step):

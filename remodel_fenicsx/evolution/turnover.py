@@ -30,9 +30,11 @@ LEAST_VOLUME = 0.05
 TISSUE_LOST = FailureCause(
     "lost tissue", "lower remodeling.turnover.volume or gain, or raise the loads"
 )
-# Largest |change of ln rho| in a step, as in the prototype; inactive near a steady state.
+# Largest |change of ln rho| in a step; a larger change is cut to this. Near a steady state changes
+# are smaller.
 LARGEST_TURNOVER = 0.5
-# Change factor of the natural length above which the rates may end a path to the steady state.
+# A path to the steady state ends as unbounded only if the natural length has changed by more than
+# this factor somewhere.
 MIN_UNBOUNDED_FACTOR = 10.0
 
 
@@ -43,7 +45,7 @@ def changed(start: Array, rates: Array, duration: float) -> Array:
 
 
 class Growth:
-    """Volumetric growth by deposited collagen: G at all points, thickening across the wall."""
+    """Volumetric growth by deposited collagen: sets G at all points, which thickens the wall."""
 
     def __init__(self, state: State, settings: Turnover):
         self.state, self.settings = state, settings
@@ -77,8 +79,8 @@ class Growth:
         self._reference[:] = content * volume / (ratio - 1.0 + volume)
         self.set(ratio)
 
-    def of_content(self, content: Array) -> Array:
-        """Return J_g of the content at each point, flattened or (elements, points)."""
+    def volume_ratio(self, content: Array) -> Array:
+        """Return J_g for a content, (n,) or (elements, points); the result has the same shape."""
         return np.asarray(
             1.0 + self.settings.volume * (content / self._reference.reshape(content.shape) - 1.0)
         )
@@ -87,10 +89,10 @@ class Growth:
         """Set J_g = 1 + phi (m/m_ref - 1) and G = G_0 (1 - (1 - 1/J_g) N (x) N)."""
         if self.state.time < self.start:
             self._reference[:] = content
-        ratio = self.of_content(content)
+        ratio = self.volume_ratio(content)
         if self.quadrature.shape[1] > 1:
-            # The strain of an element cannot follow a higher degree, which would alternate between
-            # points.
+            # J_g is reduced to the polynomial degree of the element's strain; otherwise its
+            # higher-degree part would oscillate between quadrature points.
             ratio = (
                 ratio
                 - self.quadrature.polynomial_residual(
@@ -110,7 +112,9 @@ class Growth:
 
 
 class DecayMonitor:
-    """Monitor that compares a rate with the rate at a quarter to a half of the time."""
+    """Monitor of a rate: does it decay faster than 1/t, with t since loads are constant?"""
+
+    # It compares the rate at t with an earlier rate, taken between t/4 and t/2.
 
     INITIAL = dict.fromkeys(("early_time", "early_rate", "late_time", "late_rate"), 0.0)
 
@@ -157,17 +161,24 @@ class TurnoverPass(Remodels):
         )
         self.slowest, self.fastest = 1.0 / settings.time, max(1.0, settings.gain) / settings.time
         self.growth = Growth(state, settings) if state.kinematics.grows else None
-        # `_before` has the values of the last solved state.
-        self._start = self._before = self._row = self._better = self.logarithms()
+        # Values of ln m and ln rho, outside the transaction because `before` derives them anew:
+        # `_step_start`: at the start of the step
+        # `_last_solved`: in the last solved state
+        # `_present`: in the equilibrium of this step, and in its row
+        # `_higher_order`: by the higher-order rule, for the error of the step
+        self._step_start = self._last_solved = self._present = self.logarithms()
+        self._higher_order = self._present
         self.watchers = (UnboundedGrowth.for_scene,)
-        self._start_rates: Array | None = None  # used if the mean of both ends is of higher order
+        # Rates at the start of the step, for a coupling of order 2; None for order 1.
+        self._start_rates: Array | None = None
         self.begin_path()
 
     def set_initial(self, values: Callable[[str], Array]) -> None:
         """Set content, natural length and J_g from fields of an earlier run."""
         for name in TURNED_OVER:
             self._values(name)[:] = values(name)
-        self._start = self._before = self._row = self._better = self.logarithms()
+        self._step_start = self._last_solved = self._present = self.logarithms()
+        self._higher_order = self._present
         if self.growth is not None:
             self.growth.set_initial(self._values("content"), values(GROWTH))
 
@@ -191,57 +202,61 @@ class TurnoverPass(Remodels):
 
     def change(self, rates: Array, duration: float) -> None:
         """Change m and rho over a time with constant rates (2, n)."""
-        self._before = self._start = self.logarithms()
-        self._row = changed(self._start, rates, duration)
-        self.set(self._row)
+        self._last_solved = self._step_start = self.logarithms()
+        self._present = changed(self._step_start, rates, duration)
+        self.set(self._present)
 
     def set_part(self, fraction: float) -> None:
         """Apply a fraction of the change since the last solved state."""
-        self.set(self._before + fraction * (self._row - self._before))
+        self.set(self._last_solved + fraction * (self._present - self._last_solved))
 
     def settle(self, time: float, again: bool) -> Work:
         """Record the present values as those of the solved state."""
-        self._before = self._row
+        self._last_solved = self._present
         return Work()
 
     def after(self, time: float) -> float:
-        """Compute the higher-order values; return 0, because a column has the power of turnover."""
+        """Compute the higher-order values, and return 0."""
+        # The power of turnover has a column of its own (`power`), and is not added to that of the
+        # cells.
         duration = time - self.state.time
-        self._better = changed(self._row, self.rates(), duration)
+        self._higher_order = changed(self._present, self.rates(), duration)
         if self._start_rates is not None:
-            self._better = changed(self._start, (self._start_rates + self.rates()) / 2, duration)
+            self._higher_order = changed(
+                self._step_start, (self._start_rates + self.rates()) / 2, duration
+            )
         return 0.0
 
     # ------------------------------------------------------------ error and steady state
     def row(self) -> Array:
         """Return ln m and ln rho of the solved state."""
-        return self._row
+        return self._present
 
     def higher_order(self) -> Array:
         """Return the higher-order values, by the rates of the solved state."""
-        return self._better
+        return self._higher_order
 
     def as_components(self, values: Array) -> Array:
         """Return the values by points, (n, 2)."""
         return values.T
 
-    def moved(self, values: Array, change: Array) -> Array:
+    def with_change(self, values: Array, change: Array) -> Array:
         """Return values after a change of their components (n, 2)."""
         return values + change.T
 
-    def passed(self, values: Array, time: float, residual: float) -> Array:
+    def after_pass(self, values: Array, time: float, residual: float) -> Array:
         """Return values after a step with the rates of the present state and cells."""
         return changed(values, self.rates(present=True), time - self.state.time)
 
-    def apart(self, values: Array, other: Array) -> float:
+    def distance_between(self, values: Array, other: Array) -> float:
         """Return the largest relative difference of m or rho, as radians converted to degrees."""
         return float(np.degrees(self.size((other - values).T.reshape(*self.quadrature.shape, 2))))
 
-    def left(self, time: float, residual: float) -> float:
+    def remaining_change(self, time: float, residual: float) -> float:
         """Return the largest relative change up to a time."""
         return self.quadrature.maximum(self.fastest_changes()) * (time - self.state.time)
 
-    def to_the_limit(self, time: float, duration: float, residual: float) -> Array:
+    def change_to_limit(self, time: float, duration: float, residual: float) -> Array:
         """Return the changes over a duration, because turnover has no pass to a limit."""
         return np.asarray(self.rates().T * duration).reshape(*self.quadrature.shape, 2)
 
@@ -249,8 +264,8 @@ class TurnoverPass(Remodels):
         """Return the largest relative change."""
         return self.quadrature.maximum(np.abs(change).max(axis=-1))
 
-    def follow(self, change: Array, factor: float, time: float, residual: float) -> None:
-        """Apply a multiple of the change of `to_the_limit`."""
+    def apply_change(self, change: Array, factor: float, time: float, residual: float) -> None:
+        """Apply a multiple of the change of `change_to_limit`."""
         self.change(change.reshape(-1, 2).T, factor)
 
     def begin_path(self) -> None:
@@ -273,7 +288,7 @@ class TurnoverPass(Remodels):
             f"{self.state.time:g}; try a larger remodeling.turnover.gain"
         )
 
-    def rested(self, time: float) -> None:
+    def start_at_rest(self, time: float) -> None:
         """Start volumetric growth at a time."""
         if self.growth is not None:
             self.growth.start = time
@@ -337,8 +352,8 @@ class TurnoverPass(Remodels):
 
 
 # ---------------------------------------------------------------- runs without a steady state
-# Turnover times before the rates are judged. In walls with a steady state they have risen and fall
-# by then.
+# Number of turnover times under constant loads before a warning. In walls with a steady state the
+# rates have risen to their maximum by then, and decrease.
 MIN_TURNOVER_TIMES = 10.0
 FAR_FROM_REST = 0.01  # smallest change of ln m or ln rho per turnover time that is reported
 
@@ -351,7 +366,7 @@ class UnboundedGrowth(WarnsOnce):
     def __init__(self, stepper: Stepper, held_from: float):
         super().__init__(stepper)
         self.held_from, self._slowing = held_from, DecayMonitor(self._numbers)
-        self.turnover = stepper.part(TurnoverPass.name)
+        self.turnover = stepper.process(TurnoverPass.name)
 
     @classmethod
     def for_scene(cls, scene: Scene, stepper: Stepper) -> UnboundedGrowth:
@@ -375,7 +390,7 @@ class UnboundedGrowth(WarnsOnce):
             return ""
         return (
             "turnover has not reached equilibrium: content or natural length change by up to "
-            f"{100 * rate * period:.2g} % in remodeling.turnover.time, most at "
+            f"{100 * rate * period:.2g} % within one remodeling.turnover.time, most at "
             f"{self.quadrature.shown_place_of_largest(rates)}, and the rates have decayed no "
             f"faster than 1/t since time {self.held_from + self._numbers['early_time']:g} "
             "(mechanobiological instability, docs/tissue_that_lives.md). "

@@ -264,7 +264,7 @@ class ProblemOptions:
             given = ", ".join(f"{key} = {value!r}" for key, value in self._given.items())
             raise SceneError(
                 f"solver.petsc_options: {given or 'those of PETSC_OPTIONS'}: "
-                f"PETSc rejects them (error {error.ierr}); allowed: the options of its manual pages"
+                f"PETSc rejects them (error {error.ierr}); PETSc's manual pages list all options"
             ) from error
 
     @property

@@ -62,7 +62,7 @@ class ElementFields:
     """Element means for pictures."""
 
     def __init__(self, shape: Shape, stepper: Stepper, names: Sequence[str] = OF_ELEMENTS):
-        self.observer, self.turnover = Observer(shape, stepper, ()), stepper.part("turnover")
+        self.observer, self.turnover = Observer(shape, stepper, ()), stepper.process("turnover")
         self.names = tuple(names)
         self.tissue, self._parameters = stepper.tissue, stepper.coupling.equilibrium.parameters
 

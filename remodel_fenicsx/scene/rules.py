@@ -73,12 +73,15 @@ def tissue_of_regions(scene: Scene) -> Faults:
             yield rule, f"{region}material.matrix", material.matrix
         plain = scene.remodeling.speed(scene.remodeling.kappa, material.temperature)
         if kappa != plain and law.remodels and not law.stops_at_zero_kappa:
-            key, value = (
-                ("remodeling.kappa", kappa)
-                if material.chain_density
-                else ("material.chain_density", 0.0)
-            )
-            yield f"the law {scene.remodeling.law!r} has no kappa", f"{region}{key}", value
+            rule = f"the law {scene.remodeling.law!r} has no kappa"
+            key, value = "remodeling.kappa", kappa
+            if not material.chain_density:
+                key, value = "material.chain_density", 0.0
+                rule = (
+                    f"a region without chains must not remodel, but {rule} that could be 0; choose "
+                    "another law"
+                )
+            yield rule, f"{region}{key}", value
         if not turnover.is_on:
             continue
         if not material.chain_density:
@@ -116,7 +119,7 @@ def loaded_body(scene: Scene) -> Faults:
     if scene.supports.ends == "clamped":
         yield "not allowed with supports.ends = 'clamped': the loaded radius would vary", key, value
     if measured := ", ".join(f"{in_region(name)}cells.fibres" for name in scene.measured_cells):
-        yield f"not allowed with {measured}: unloading moves the positions of its rows", key, value
+        yield f"not allowed with {measured}: it has positions of the loaded geometry", key, value
     if scene.cases:
         rule = (
             "not allowed with [[cases]]: the loaded geometry belongs to one set of loads; run "
@@ -131,7 +134,7 @@ def same_strain(scene: Scene) -> Faults:
     for name, load in scene.loads.items():
         if scene.load_kinds[name].of_one_strain and not KINEMATICS[made.name].homogeneous:
             reasons = "; ".join(made.objections["point"]) or f"model.kinematics = {made.name!r}"
-            rule = f"needs the same strain everywhere, model.kinematics = 'point': {reasons}"
+            rule = f"needs a uniform strain (model.kinematics = 'point'), but {reasons}"
             yield rule, f"loads.{name}.value", load.value
 
 
@@ -218,11 +221,11 @@ def measured_natural_state(scene: Scene) -> Faults:
 def natural_state(scene: Scene) -> Faults:
     """Check that shape, formulation and cells allow residual stress."""
     natural, shape = scene.natural, scene.geometry
-    able, none = Walled, "none"
+    able, none = Walled, "absent"
     if scene.is_stress_free or natural.fibres:
         return
     value: object
-    key, value = "natural.layers", len(natural.layers)
+    key, value = "natural.layers", None
     for name, properties in scene.properties().items():
         if properties.material.has_elastin:
             key, none = f"{in_region(name)}material.elastin.prestretch", "[1.0, 1.0]"
@@ -320,11 +323,12 @@ def growth(scene: Scene) -> Faults:
         if not time.is_equilibrium:
             yield "needs time.end = 'equilibrium'; otherwise set a time", key, EQUILIBRIUM
         if scene.last_hold is None:
-            yield "needs loads.NAME.ramp with a hold before a further change", key, EQUILIBRIUM
+            rule = "needs an interval of constant loads before a further change (loads.NAME.ramp)"
+            yield rule, key, EQUILIBRIUM
         if scene.cases:
             yield "needs a scene without [[cases]]", key, EQUILIBRIUM
     elif start and time.is_equilibrium:
-        rule = "must be 0 or 'equilibrium' with time.end = 'equilibrium', which has no times"
+        rule = "time.end = 'equilibrium' has no time axis; set 0 or 'equilibrium'"
         yield rule, key, start
     elif start and start > time.end:
         yield f"must be at most time.end = {format_value(time.end)}", key, start

@@ -14,21 +14,23 @@ F = TypeVar("F", bound=Exception)
 class Attempt(NamedTuple):
     """Attempt to solve a step: description, class or function, and log message of its failure."""
 
+    # The message has the fields {reason}, why the attempt failed, and {how} to proceed.
+
     what: str
     where: str
-    fails: str = ""
+    message: str = ""
 
 
 FROM_EXPECTED = Attempt(
     "from the displacement predicted by the last steps",
     "Staggered",
-    "Newton failed from the predicted displacement",
+    "Newton failed from the predicted displacement ({reason}); using the last one",
 )
-FROM_LAST = Attempt("from the last displacement", "Staggered", "solving in substeps")
+FROM_LAST = Attempt("from the last displacement", "Staggered", "{reason}; solving in substeps")
 MADE_ANEW = Attempt(
     "in each solve: again, with a new factorisation or new multigrid levels in every iteration",
     "FullNewton.fallback",
-    "Newton failed; retrying",
+    "Newton failed ({reason}); retrying {how}",
 )
 IN_PARTS = Attempt(
     "in substeps: first the remodeled cells, then the loads; a failed substep is halved", "Change"
@@ -37,7 +39,7 @@ STEP_REFUSED = Attempt("the step fails, with its cause and advice", "diagnose_fa
 SHORTER_STEP = Attempt(
     "with time.tolerance: a quarter of the step size, up to three times",
     "StepControl",
-    "retrying with a smaller step",
+    "{reason}; retrying with a smaller step",
 )
 ATTEMPTS = (FROM_EXPECTED, FROM_LAST, MADE_ANEW, IN_PARTS, STEP_REFUSED, SHORTER_STEP)
 """Attempts in their order; docs/architecture.md has the table."""
@@ -53,4 +55,4 @@ def attempted(solve: Callable[[], T], *failures: type[F]) -> T | F:
 
 def say(attempt: Attempt, reason: object, how: str = "") -> None:
     """Log that an attempt has failed, and how the next one proceeds."""
-    log.info("%s%s: %s", attempt.fails, f" {how}" if how else "", reason)
+    log.info("%s", attempt.message.format(reason=reason, how=how))

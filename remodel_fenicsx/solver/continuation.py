@@ -253,7 +253,8 @@ class Continuation:
             if self.refusal is None and failure.refusal.kind in END_OF_PATH:
                 self._warn_of_jump(solution, failure.refusal)
             log.info(
-                "time %g: solution far from the tangent's prediction, and its substeps failed: %s",
+                "time %g: the solution is far from the tangent's prediction; it stays, because "
+                "repeating the step in substeps failed: %s",
                 self.time,
                 failure,
             )

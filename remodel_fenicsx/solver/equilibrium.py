@@ -280,7 +280,7 @@ class Equilibrium:
         turns = at.size > 0 and bool(determinant_changes_sign(F[at], G[at]).any())
         return bool(allreduce(self.comm, turns, MPI.LOR))
 
-    def room(self, far: float) -> float:
+    def safe_change(self, far: float) -> float:
         """Return the largest |dF| with J > 0 and r/L < `far` at all points. Collective."""
         look, lengths = self.evaluate(), self.state.cells.dimension_values
         chains = np.sqrt((lengths**2).sum(axis=-1)) / self.locking_length()

@@ -175,7 +175,7 @@ class LaggedFactorisation:
         except PETSc.Error:
             failed = True
         if failed:
-            log.info("%s of the tangent failed", kind)
+            log.info("%s of the tangent failed (tried in this order: Cholesky, LDL^T, LU)", kind)
             self.close()
         return not failed
 

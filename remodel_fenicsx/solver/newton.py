@@ -33,24 +33,25 @@ Array = NDArray[np.float64]
 
 
 # ---------------------------------------------------------------- convergence
-# The residual must be below a tolerance that is not below rounding errors.
+# The residual must not exceed a tolerance. The tolerance is at least the rounding error.
 
 FORCE_ROUNDINGS = 8.0  # accepted residual over the rounding error of assembled forces
-# Accepted residual over the rounding error of displacements; 0.07 to 4 were measured on thin and on
-# stiff walls. A residual that only this rounding error allows is accepted if it stagnates.
+# Accepted residual over the rounding error of displacements. On thin and on stiff walls 0.07 to 4
+# was measured.
 ROUNDED_STRAINS = 8.0
-# Largest error of a prescribed displacement, relative to the body's size. No force measures it.
+# Largest error of a prescribed displacement, relative to the body's size. It needs a tolerance of
+# its own, because the residual is zero at constrained dofs.
 PRESCRIBED_TOLERANCE = 1e-10
 # Error of prescribed values up to rounding, relative to the body's size.
 PRESCRIBED_ROUNDING = 1e-13
 # Residual of all substeps but the last, relative to the nodal forces. A substep may be 1/256 of a
-# step, and the next one is compared with its direction. With 1e-3, just below which quasi-Newton
-# steps stop, some were mistaken for jumps.
+# step. Jump detection compares each substep with the direction of the one before. With 1e-3 the
+# quasi-Newton solver stopped too early, and some substeps were mistaken for jumps.
 INTERMEDIATE_TOLERANCE = 1e-5
-# If r/L exceeds the first number, the rounding error of one point may exceed the second one times
-# the nodal forces. A residual below it is then accepted only if it exceeds the third one times the
-# residual before.
-NEARLY_STRAIGHT, COARSE = 0.99, 1e-8
+NEARLY_STRAIGHT = 0.99  # r/L above which the rounding error of one point may dominate
+COARSE = 1e-8  # tolerance over nodal forces above which that error does dominate
+# Residual over the previous one above which Newton's method stagnates. A residual that only
+# rounding errors allow is accepted only then, also if no chain is nearly straight.
 STAGNATION = 0.25
 
 
@@ -70,18 +71,18 @@ class Convergence:
     def begin(self) -> None:
         """Prepare for a solve: parameters may change between solves, but not within one."""
         self._largest = self.equilibrium.parameters.largest()
-        self.extended(self.max_chain_extension)
+        self.set_max_chain_extension(self.max_chain_extension)
 
-    def extended(self, max_chain_extension: float) -> None:
-        """Set the largest r/L of an admissible state."""
+    def set_max_chain_extension(self, max_chain_extension: float) -> None:
+        """Set the largest r/L of an admissible state, and the rounding error of its stress."""
         self.max_chain_extension = max_chain_extension
         self._stress_rounding = stress_rounding(self._largest, max_chain_extension)
 
     def reached(self, norm: float, previous: float) -> bool:
         """Return whether a residual norm is accepted; `previous`: the norm before, or infinity."""
-        # Near L the rounding error of the worst point may be far above that of all other points,
-        # and the largest displacement is not that of all elements. A residual below such an error
-        # is accepted only if it stagnates.
+        # The rounding error is computed for the largest r/L and the largest displacement of the
+        # body. Near L it may be far above the rounding error of most points. A residual that only
+        # this error allows is therefore accepted only if Newton's method stagnates.
         if self.prescribed_gap > PRESCRIBED_TOLERANCE:
             return False
         if self.intermediate and norm <= INTERMEDIATE_TOLERANCE * self.force_scale:
@@ -118,12 +119,13 @@ class Convergence:
 # ---------------------------------------------------------------- admissible states
 # The limits r < L and J > 0 in the line search of Newton's method.
 
-# A Newton step that ends above this r/L keeps this fraction of 1 - r/L.
+# If a Newton step would end above the first number, an r/L, each point there keeps at least the
+# second number times its 1 - r/L before the step.
 NEAR_LIMIT, RESERVE = 0.95, 0.3
 NOWHERE = StateLimits(0.0, 1.0, (np.nan,) * 3)
 LINE_SEARCH_HALVINGS = 20  # number of halvings of a Newton step before the line search fails
-# Smallest displacement of a jump, relative to the body's size: 1 % of the radius of a tube of this
-# length.
+# Smallest displacement of a jump, relative to the body's size; for a tube ten radii long this is
+# 1 % of its radius.
 POSSIBLE_JUMP = 1e-3
 
 
@@ -148,7 +150,8 @@ class Solution(SolverCounts):
 
     residual: float = 0.0
     extension: StateLimits = NOWHERE
-    # Distance from the origin over that of the first iterate; 0 for small distances.
+    # Distance of the solution from the step's start, over the distance of the first iterate from
+    # there; 0 for small distances.
     displacement_ratio: float = 0.0
 
 
@@ -174,14 +177,14 @@ class SolveFailure(RuntimeError, SolverCounts):
 class _Solve:
     """Data of one solve."""
 
-    origin: Array
+    step_start: Array  # unknowns at the start of the step
     first_iterate: float | None = None
     norm: float = np.inf
     previous: float = np.inf
     inadmissible: bool = False
-    # Radius |dF| around the last evaluated state in which all states are admissible.
-    room: float = 0.0
-    is_certain: bool = False  # whether the state is within this radius
+    # All states whose |dF| from the last evaluated state is below this are admissible.
+    safe_change: float = 0.0
+    is_certain: bool = False  # whether the state is one of them
 
 
 # By PETSc's SNESConvergedReason, as numbers, because the names differ between its versions.
@@ -195,7 +198,7 @@ DIVERGED_MAX_IT = -5
 
 
 def failure_text(reason: int, iterations: int, extension: StateLimits) -> str:
-    """Return why SNES has failed; if it has converged, the state is not admissible."""
+    """Return why a solve has failed. If SNES has converged, its state is not admissible."""
     if reason >= 0:
         return (
             f"reached r/L = {extension.max_chain_extension:.4f}, J = {extension.min_jacobian:.4g}"
@@ -226,13 +229,13 @@ class GuardedNewton:
         """Create PETSc's objects of the method, which serve all steps."""
         equilibrium, settings = self.equilibrium, self.settings
         kinematics, unknowns = equilibrium.state.kinematics, self._x.getSize()
-        ranks, narrow = equilibrium.comm.size, not kinematics.three_dimensional
+        ranks, is_reduced = equilibrium.comm.size, not kinematics.three_dimensional
         self.method = method = resolve_auto(
-            settings.method, unknowns, narrow, kinematics.suits_multigrid
+            settings.method, unknowns, is_reduced, kinematics.suits_multigrid
         )
         # In three dimensions a named method is not replaced, so that results do not depend on the
         # size.
-        small = is_small(unknowns, narrow) and (narrow or settings.method == AUTO)
+        small = is_small(unknowns, is_reduced) and (is_reduced or settings.method == AUTO)
         self._options = ProblemOptions(method_options(method, ranks, small), settings.petsc_options)
         bounded = (
             method == LAGGED
@@ -274,14 +277,15 @@ class GuardedNewton:
             thing.destroy()
         self._snes = None
 
-    def solve(self, origin: Array | None = None, loose_tolerance: bool = False) -> Solution:
+    def solve(self, step_start: Array | None = None, loose_tolerance: bool = False) -> Solution:
         """Solve from the present unknowns, and set them.
 
-        With `loose_tolerance` more substeps follow.
+        `step_start`: unknowns at the start of the step; by default the present ones. Set
+        `loose_tolerance` if further substeps follow; an intermediate tolerance is then enough.
         """
         self.convergence.intermediate = loose_tolerance
         first = attempted(
-            lambda: self._attempt(origin, self._linear.iteration_factor), SolveFailure
+            lambda: self._attempt(step_start, self._linear.iteration_factor), SolveFailure
         )
         if isinstance(first, Solution):
             return first
@@ -291,7 +295,7 @@ class GuardedNewton:
         words, other_way = second
         say(MADE_ANEW, first.reason, words)
         with other_way:
-            again = attempted(lambda: self._attempt(origin), SolveFailure)
+            again = attempted(lambda: self._attempt(step_start), SolveFailure)
         again.count(first)
         if isinstance(again, SolveFailure):
             raise again
@@ -305,12 +309,12 @@ class GuardedNewton:
         )
         return extension.admissible and not near
 
-    def _attempt(self, origin: Array | None, iteration_factor: int = 1) -> Solution:
+    def _attempt(self, step_start: Array | None, iteration_factor: int = 1) -> Solution:
         start, tangents = self._values.copy(), self._linear.tangents
         self._snes.setTolerances(max_it=iteration_factor * self._most_iterations)
         self.convergence.begin()
         self._to_petsc(self._x)
-        self._present = _Solve(start if origin is None else origin)
+        self._present = _Solve(start if step_start is None else step_start)
         self._linear.begin()
         self._snes.solve(None, self._x)
         self._warn_of_unused_options()
@@ -321,7 +325,7 @@ class GuardedNewton:
         solution = Solution(newton, linear, self._linear.tangents - tangents, norm, extension)
         if reason >= 0 and not self._present.inadmissible and extension.admissible:
             self._linear.ended(newton)
-            solution.displacement_ratio = self._reach()
+            solution.displacement_ratio = self._displacement_ratio()
             return solution
         self._values[:] = start
         if extension.stop_signal:
@@ -333,10 +337,10 @@ class GuardedNewton:
             text, solution, left, relative, norm > STAGNATION * self._present.previous
         )
 
-    def _reach(self) -> float:
+    def _displacement_ratio(self) -> float:
         """Return `Solution.displacement_ratio` of the present unknowns. Collective."""
         state, present = self.equilibrium.state, self._present
-        change = self._values - present.origin
+        change = self._values - present.step_start
         largest = allreduce(state.comm, np.abs(change).max(initial=0.0), MPI.MAX)
         if not present.first_iterate or largest < POSSIBLE_JUMP * state.loading.domain.size:
             return 0.0
@@ -346,9 +350,11 @@ class GuardedNewton:
         """Return the norm of a change of the unknowns that this rank owns. Collective."""
         return float(np.sqrt(allreduce(self.equilibrium.comm, float(change @ change), MPI.SUM)))
 
-    def answer(self, equilibrium: Equilibrium, tangents: int) -> Array:
-        """Solve one linear system for the change that balances `equilibrium`. Collective."""
-        # `tangents` is the number assembled for that state. Without any a new one is assembled.
+    def newton_correction(self, equilibrium: Equilibrium, tangents: int) -> Array:
+        """Return the Newton step for `equilibrium`. Collective.
+
+        `tangents`: number of tangents assembled for this state; if 0, one is assembled.
+        """
         self._to_petsc(self._x)
         equilibrium.assemble_internal(self._residual)
         equilibrium.assemble_external(self._external)
@@ -422,8 +428,8 @@ class GuardedNewton:
             extension = equilibrium.extension()
             present.inadmissible = not extension.admissible or extension.stop_signal > 0
             if not present.inadmissible:
-                self.convergence.extended(extension.max_chain_extension)
-                present.room = equilibrium.room(NEAR_LIMIT) if self._bounded else 0.0
+                self.convergence.set_max_chain_extension(extension.max_chain_extension)
+                present.safe_change = equilibrium.safe_change(NEAR_LIMIT) if self._bounded else 0.0
         if present.inadmissible:
             residual.set(np.nan)
             return
@@ -432,18 +438,18 @@ class GuardedNewton:
     def _keep_admissible(self, x: PETSc.Vec, step: PETSc.Vec) -> bool:
         """Halve the step until r < L and J > 0 (trial: x - step). Return whether it changed."""
         # J must be positive on the whole path, because a step that inverts two axes of an element
-        # has J > 0 at its end again. Near L each point also keeps a fraction of its 1 - r/L. Much
-        # too near to L forces are huge, and Newton's method moves away only by a factor of 1.5 an
-        # iteration.
+        # has J > 0 at its end again. Near L each point also keeps a fraction of its 1 - r/L. If
+        # a point comes much too near to L, its forces are huge, and each iteration increases its
+        # 1 - r/L only by a factor of 1.5.
         met, present = self.convergence.prescribed_gap <= PRESCRIBED_ROUNDING, self._present
         improved = self._linear.improve(x, self._snes.getFunction()[0], step, met)
         if present.first_iterate is None:
             first = x.array_r - step.array_r
-            present.first_iterate = self._length(first - present.origin[: first.size])
-        # This bounds |dF|. No evaluation is needed if the bound is within the admissible radius.
+            present.first_iterate = self._length(first - present.step_start[: first.size])
+        # This bounds |dF|. No evaluation is needed if all states within the bound are admissible.
         largest = np.sqrt(3) * step.norm(PETSc.NormType.NORM_INFINITY)
-        present.room -= self.equilibrium.quadrature.largest_gradient * largest
-        present.is_certain = present.room > 0.0
+        present.safe_change -= self.equilibrium.quadrature.largest_gradient * largest
+        present.is_certain = present.safe_change > 0.0
         if present.is_certain:
             return improved
         self._from_petsc(x)

@@ -110,8 +110,9 @@ class EquilibriumStability(Watcher):
         if now <= unloaded:
             self._log(
                 logging.INFO,
-                f"{step.label}: {eigenvalues(now)} of the tangent. The unloaded body has "
-                f"{unloaded}, from the stress of its initial cells: the equilibrium is not lost",
+                f"{step.label}: {eigenvalues(now)} of the tangent. The unloaded body already "
+                f"has {unloaded}, caused by the stress of its initial cells, so this is no loss "
+                "of stability",
             )
             return
         text = (

@@ -326,9 +326,9 @@ class WeakTension(WarnsOnce):
         ):
             self.emit(
                 step,
-                f"loads too small: stresses near the rounding threshold ({weakness:.2g} of the "
-                "largest stress) remodel at half speed or less, so the cells reorient too slowly. "
-                "Use loads with larger strains",
+                "loads too small: where the stress is near the rounding threshold "
+                f"({weakness:.2g} of the largest stress), cells remodel at half speed or less. "
+                "Increase the loads",
             )
 
 
@@ -400,6 +400,6 @@ class FrontsInLayers(ShapeWarning):
         if not jumps:
             return ""
         return (
-            f"{'; '.join(jumps)}. A front lies there, so the mean depends on the mesh; "
+            f"{'; '.join(jumps)}. A front lies in these elements, so the mean depends on the mesh; "
             "set a larger mesh.refinement"
         )

@@ -135,7 +135,7 @@ def test_walls_rest_where_an_independent_program_says(
     """Radius, thickness, means, angles, what a cut shows, curves continued to the faces; nothing is said."""
     with simulated(at_rest(case)) as (simulation, (row,)):
         stress = simulation.stepper.remodeling.driving_tensor()[1][:, 1, 1]
-        depth, content = simulation.cells.local_axes.depth.ravel(), simulation.stepper.part(
+        depth, content = simulation.cells.local_axes.depth.ravel(), simulation.stepper.process(
             "turnover"
         )._values("content")
     compare(row, RESTS[case])
@@ -217,7 +217,7 @@ def test_the_wall_is_as_large_as_its_tissue() -> None:
     """Volume between the deformed faces: the integral of J_e J_g."""
     with simulated(wall(0.5, 400.0)) as (simulation, rows):
         F, quadrature = simulation.state.elastic_gradient(), simulation.quadrature
-        growth = simulation.stepper.part("turnover").growth.ratio
+        growth = simulation.stepper.process("turnover").growth.ratio
         volume = quadrature.integral(np.linalg.det(F).reshape(growth.shape) * growth)
     inner, outer = rows[-1]["inner_radius"], rows[-1]["outer_radius"]
     assert volume == pytest.approx(np.pi * (outer**2 - inner**2) * 2.0 * 1.1, rel=1e-6)
@@ -429,7 +429,7 @@ def test_the_time_to_rest_is_that_of_the_formula() -> None:
         with made(
             membrane(0.0, gain, ramped(20.0, pressure=0.04, elongation=0.1), 700.0, 20.0 / gain)
         ) as simulation:
-            turnover = simulation.stepper.part("turnover")
+            turnover = simulation.stepper.process("turnover")
             for step in simulation.steps():
                 rates += [np.abs(turnover.rates()).max()] if step.time in (600.0, 700.0) else []
             tissue = simulation.stepper.remodeling.parameters.largest()

@@ -44,7 +44,7 @@ def test_it_is_where_time_leads(driver: str) -> None:
     changes = {"driver": driver, "coupling": "relaxed" if driver == "finger" else "staggered"}
     at_once = Simulation(artery(remodeling=changes), SELF)
     row = solved(at_once)
-    way = at_once.way
+    way = at_once.time_stepping
     assert isinstance(way, Homeostasis) and row["substeps"] == way.steps
     assert row["pass_residual"] < 1e-6
     in_time = Simulation(

@@ -233,7 +233,10 @@ def test_turnover_has_the_mean_rates_of_all_cases() -> None:
     for cases in (pulse(0.33), *([case | {"weight": 1.0}] for case in pulse(0.33))):
         with simulated(artery(cases, end=4.0, **tables)) as (simulation, _):
             changes.append(
-                [np.log(simulation.stepper.part("turnover")._values(name)) for name in columns[:2]]
+                [
+                    np.log(simulation.stepper.process("turnover")._values(name))
+                    for name in columns[:2]
+                ]
             )
     both, diastole, systole = np.array(changes)
     np.testing.assert_allclose(both, 2 / 3 * diastole + 1 / 3 * systole, atol=1e-12)

@@ -143,7 +143,7 @@ def test_no_row_of_the_printed_method_is_off_by_more_than_the_tolerance() -> Non
 
 def test_lengths_count_as_angles(monkeypatch: pytest.MonkeyPatch) -> None:
     """A cube under a large force whose chains are not looked at, against Richardson's extrapolation of halved steps."""
-    monkeypatch.setattr(RemodelingPass, "apart", lambda self, row, better: 0.0)
+    monkeypatch.setattr(RemodelingPass, "distance_between", lambda self, row, better: 0.0)
     scene = scene_from_dict(
         {
             "preset": COUPLINGS["staggered"],
@@ -290,7 +290,7 @@ def controlled(
     simulation = Simulation(
         tube("staggered", end, **{"time.tolerance": 1.0, **changes}), MPI.COMM_SELF
     )
-    control = simulation.way
+    control = simulation.time_stepping
     assert control is not None
 
     def measured(step: Step) -> Estimate:

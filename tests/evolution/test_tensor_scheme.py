@@ -273,7 +273,7 @@ def test_where_the_extrapolated_target_would_break_the_cells_the_last_one_counts
         targets["direction"][:points], targets["switch"][:points] = np.diag(along), 1.0
     before, target = cells.structure_tensor(), coupling._extrapolated(state.time + 1.0)
     with caplog.at_level("INFO"):
-        coupling._follow(target, state.time + 1.0)
+        coupling._set_cells_after(target, state.time + 1.0)
     assert f"time 5: {points} points follow the last stress" in caplog.text
     A = cells.structure_tensor()
     np.testing.assert_allclose(

@@ -48,7 +48,7 @@ def test_an_unstressed_wall_comes_to_rest_with_an_opening_angle_of_its_own(
     for end, degrees in ((960.0, 3.0), ("equilibrium", 0.5)):
         with made(wall(end, 8.0, GROWS, COLUMNS)) as simulation:
             row = list(simulation.steps())[-1].row
-            turnover, order = simulation.stepper.part("turnover"), np.argsort(
+            turnover, order = simulation.stepper.process("turnover"), np.argsort(
                 simulation.quadrature.coordinates[..., 0].ravel()
             )
             assert [row[name] for name in ANGLES] == pytest.approx([6.7, 10.3, 14.5], abs=1.0)
@@ -59,7 +59,7 @@ def test_an_unstressed_wall_comes_to_rest_with_an_opening_angle_of_its_own(
             ):
                 values = turnover._values(name).ravel()[order]
                 assert values[[0, len(values) // 2, -1]] == pytest.approx(expected, rel=0.03)
-    assert simulation.way.steps < 100
+    assert simulation.time_stepping.steps < 100
     assert 40.0 * np.abs(turnover.rates()).max() < 2e-4
     assert not [record for record in caplog.records if record.levelname == "WARNING"]
 
@@ -187,7 +187,7 @@ def test_a_growth_that_rests_is_no_instability_however_large(
     values["loads"]["pressure"]["ramp"] += [[800.0, 1.0], [824.0, 1.6]]
     values["time"]["tolerance"] = 3.0
     with caplog.at_level(NOTICE), simulated(values) as (simulation, _):
-        assert simulation.stepper.part("turnover")._values("content").max() > 10.0
+        assert simulation.stepper.process("turnover")._values("content").max() > 10.0
     assert not [
         record
         for record in caplog.records
@@ -240,7 +240,7 @@ def test_a_step_in_parts_has_parts_of_its_turnover(
     values = wall(40.0, 8.0, GROWS, COLUMNS, coupling=coupling) | {"solver": {"predictor": "none"}}
     whole = rows_of(values)
     simulation = Simulation(scene_from_dict(values))
-    coupled, turnover = simulation.stepper.coupling, simulation.stepper.part("turnover")
+    coupled, turnover = simulation.stepper.coupling, simulation.stepper.process("turnover")
     set_part, parts, refused = turnover.set_part, [], set()
     newton = coupled.blend.newton
     solve = newton.solve

@@ -143,7 +143,7 @@ def test_each_region_turns_over_with_its_own_chains() -> None:
     tension = stretch * g(stretch * r0, L) / (1.1 * g(1.1 * r0, L))
     content = np.clip(tension - 1.0, -1.0, 1.0) / 10.0
     length = (0.1 + np.maximum(content, 0.0)) * (stretch / 1.1 - 1.0)
-    values = simulation.stepper.part("turnover").higher_order()
+    values = simulation.stepper.process("turnover").higher_order()
     simulation.close()
     np.testing.assert_allclose(values, 2.0 * np.array([content, length]), rtol=1e-9)
     assert len(set(is_outer)) == 2

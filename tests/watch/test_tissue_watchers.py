@@ -135,7 +135,7 @@ def test_a_front_within_the_inner_layer_is_said(
     scene = tube_scene(
         loads=loads, mesh={"degree": 2, "refinement": refinement}, remodeling=remodeling, time=time
     )
-    found = said(scene, caplog, "A front lies there")
+    found = said(scene, caplog, "A front lies in these elements")
     assert [level for level, _ in found] == [logging.WARNING] * (refinement == 1)
     assert all("fibre_angle_inner" in text for _, text in found)
 
