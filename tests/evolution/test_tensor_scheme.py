@@ -274,7 +274,7 @@ def test_where_the_extrapolated_target_would_break_the_cells_the_last_one_counts
     before, target = cells.structure_tensor(), coupling._extrapolated(state.time + 1.0)
     with caplog.at_level("INFO"):
         coupling._set_cells_after(target, state.time + 1.0)
-    assert f"time 5: {points} points follow the last stress" in caplog.text
+    assert f"time 5: {points} points use the last target" in caplog.text
     A = cells.structure_tensor()
     np.testing.assert_allclose(
         A[0], np.broadcast_to(np.diag([0.0, 0.0, 1.0]), A[0].shape), atol=1e-14
