@@ -20,7 +20,6 @@ from petsc4py import PETSc
 from remodel_fenicsx.evolution.stepper import Pause, Step, Watcher
 from remodel_fenicsx.fem.kinematics import KINEMATICS
 from remodel_fenicsx.fem.quadrature import Quadrature
-from remodel_fenicsx.fem.solver_methods import MIN_PARALLEL_UNKNOWNS
 from remodel_fenicsx.fem.assembly import raise_on_all_ranks
 from remodel_fenicsx.results.checkpoint import Checkpoints, restore_state
 from remodel_fenicsx.results.checkpoint_file import Checkpoint, CheckpointError, read_checkpoint
@@ -301,14 +300,6 @@ def _record(
         ranks = "1 rank" if comm.size == 1 else f"{comm.size} ranks"
         log.info(BEGUN + "%s on %s, results in %s", scene.name, ranks, place)
         log.info("%s", scene.summary())
-        vector = simulation.unknown.x.petsc_vec
-        unknowns = vector.getSize()
-        if comm.size > 1 and unknowns < MIN_PARALLEL_UNKNOWNS:
-            log.info(
-                "%d unknowns: one rank is faster than %d (docs/speed_and_accuracy.md, Ranks)",
-                unknowns,
-                comm.size,
-            )
         # This scene has the paths of its files; `scene` has their names in the run's folder.
         for warning in simulation.scene.warnings(simulation.domain):
             log.warning("%s", warning)

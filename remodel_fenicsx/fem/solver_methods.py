@@ -140,7 +140,6 @@ FACTOR_OPTIONS: dict[str, Mapping[str, object]] = {
 # and 0.25 at 1,500 (cubes and tubes of random cells, 40 steps).
 MAX_DIRECT_REDUCED, MAX_DIRECT_3D = 2000, 200
 MIN_MULTIGRID = 100_000  # unknowns above which even a few factorisations cost more than multigrid
-MIN_PARALLEL_UNKNOWNS = 5_000  # unknowns below which a second rank costs more than it saves
 
 
 def is_small(unknowns: int, reduced: bool) -> bool:
