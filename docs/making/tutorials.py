@@ -28,7 +28,7 @@ PICTURES = {  # of docs/figures: what a page's commands leave
     "tutorial-layers.png": "layers.png",
     "tutorial-bent.png": "bent.png",
     "tutorial-residual-stress.png": "angles.png",
-    "tutorial-hypertension.png": "hypertensive.png",
+    "tutorial-carotid.png": "carotid.png",
     "tutorial-fit.png": "fitted/fit.png",
     "tutorial-biaxial.png": "biaxial/fit.png",
     "tutorial-gel.png": "gel.png",
