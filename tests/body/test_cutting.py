@@ -266,4 +266,4 @@ def test_no_equilibrium_of_the_cut_is_said(
     monkeypatch.setattr("remodel_fenicsx.model.residual_stress.cut", fails)
     with caplog.at_level(logging.WARNING):
         assert np.isnan(angles(scene(**{"time.end": 5.0})))[0]
-    assert "no opening_angle: out of balance by 0.1" in caplog.text
+    assert "no equilibrium without loads: out of balance by 0.1" in caplog.text

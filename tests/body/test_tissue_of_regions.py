@@ -106,7 +106,7 @@ def test_what_needs_chains_everywhere_is_refused() -> None:
         ),
         (
             {"remodeling": {"law": "rotation"}},
-            "regions.plaque.material.chain_density = 0.0: the law 'rotation' has no",
+            "regions.plaque.material.chain_density = 0.0: a region without chains must not remodel",
         ),
     ):
         with pytest.raises(SceneError) as refused:

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from remodel_fenicsx import Recording, Scene, read_scene
+from remodel_fenicsx import Recording, Scene, preset_scene, read_scene
 from remodel_fenicsx.body.tube import whole_tube
 from remodel_fenicsx.extend import DRIVERS, Driver
 from remodel_fenicsx.model.cells import structure_tensor
@@ -322,7 +322,7 @@ def network_by_hand(simulation: Any) -> np.ndarray:
     """Cauchy stress of the chains with their repulsion at all points, for cells along the axes."""
     of, state = simulation.stepper.remodeling.parameters.at_points(), simulation.state
     F, A = state.elastic_gradient(), structure_tensor(*simulation.cells.point_cells[:2])
-    growth = simulation.stepper.part("turnover").growth.ratio.reshape(-1)
+    growth = simulation.stepper.process("turnover").growth.ratio.reshape(-1)
     J, rho = np.linalg.det(F) * growth, of.natural_length
     r = np.sqrt(np.einsum("nij,nij->n", F @ A, F)) / rho
     g, g0 = (secant_stiffness(length, of.contour_length) for length in (r, of.end_to_end_length))
@@ -393,3 +393,15 @@ def test_two_ranks_find_the_same(cases: Cases) -> None:
     (one,), (two,) = (cases(ON_ONE_AND_TWO_RANKS, ranks) for ranks in (1, 2))
     for name in ("u", "lumen_volume", *ALONG):
         np.testing.assert_allclose(two[name], one[name], rtol=1e-7, atol=1e-8, err_msg=name)
+
+
+def test_a_wall_without_chains_has_stress_in_the_matrix_alone() -> None:
+    """Both parts are columns there too."""
+    columns = ["hoop_stress_matrix", "hoop_stress_collagen"]
+    changes = {"material.chain_density": 0.0, "remodeling.law": "none", "time.end": 1.0}
+    scene = preset_scene("consistent", "tube").with_values(
+        {"cells.initial": "isotropic", "model.kinematics": "radial", "output.columns": columns}
+        | changes
+    )
+    row = rows_of(scene)[-1]
+    assert row["hoop_stress_matrix"] > 0 == row["hoop_stress_collagen"]

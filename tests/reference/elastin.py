@@ -71,6 +71,8 @@ class ElasticWall(Wall):
     exponent: float = 2.0
 
     def __post_init__(self) -> None:
+        if self.opening_angle:
+            raise ValueError("a wall with elastin and an opening angle has no reference here")
         super().__post_init__()
         self.G = np.outer(fresh(self.material, self.prestretch), np.ones(self.points))
 
