@@ -197,7 +197,8 @@ class Measurement:
     @cached_property
     def collagen_wall_stress(self) -> Array:
         """Part of `wall_stress` that the network bears, (elements, points, 3)."""
-        if self.observer.stepper.tissue.chain is None:
+        stepper = self.observer.stepper
+        if stepper.tissue.chain is None:
             return np.zeros_like(self.wall_stress)
         return self._in_the_wall(self._cauchy_stress("collagen", lambda s: s.collagen))
 
