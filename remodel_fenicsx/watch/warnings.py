@@ -376,8 +376,6 @@ class FrontsInLayers(ShapeWarning):
     def check(self, step: Step) -> str:
         """Return a warning for layers with a front in most elements. Collective."""
         cells, quadrature = self.state.cells, self.quadrature
-        if not self.shape.angle_layers:
-            return ""
         depths = cells.local_axes.nodal_depth[geometry_dofmap(quadrature.mesh)]
         angles = self.shape.fibre_angle(
             cells.dimension_values, cells.axis_values, cells.local_axes.axes

@@ -177,6 +177,15 @@ def test_a_full_disk_raises_and_keeps_what_was_published(tmp_path):
     assert [found.name for found in tmp_path.iterdir()] == ["f.vtkhdf"]
 
 
+def test_a_file_that_is_continued_without_a_step_ends_at_its_time(tmp_path):
+    path, field = tmp_path / "f.vtkhdf", np.zeros((3, 8, 3), np.float32)
+    with TransientGrid(path, CUBE, VTK_CUBE, 12) as grid:
+        for k in range(3):
+            grid.append(k, {"u": field[k]})
+    TransientGrid.continued(path, 1.0).close()
+    assert len(raw_series(path, "u", 8)) == 2
+
+
 @pytest.mark.parametrize("steps", [1, 64])  # the index of HDF5 grows a level at 64 chunks
 def test_a_process_that_is_killed_leaves_what_was_published(tmp_path, monkeypatch, steps):
     path, copies, write = tmp_path / "f.vtkhdf", [], DeferredErrorFile.write

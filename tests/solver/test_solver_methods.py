@@ -365,7 +365,8 @@ def test_what_the_bound_spares_is_admissible(monkeypatch: pytest.MonkeyPatch) ->
     simulation, _ = simulated("lagged", solver__predictor="autoregressive", time__end=4.0)
     assert sum(spared) > len(spared) / 2
     equilibrium, x = simulation.stepper.coupling.equilibrium, simulation.unknown.x.array
-    for far in (0.95, 0.99, 1.0):  # as far as the bound allows, in many directions
+    near = equilibrium.extension().max_chain_extension + 1e-3
+    for far in (near, 0.95, 0.99, 1.0):  # as far as the bound allows, in many directions
         change, start = equilibrium.safe_change(far), x.copy()
         for seed in range(5):
             way = np.random.default_rng(seed).standard_normal((len(x) // 3, 3))
