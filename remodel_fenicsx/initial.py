@@ -21,7 +21,7 @@ from remodel_fenicsx.fem.kinematics import KINEMATICS, FreeLength, NaturalConfig
 from remodel_fenicsx.fem.quadrature import Quadrature
 from remodel_fenicsx.model.axes import GROWTH, NATURAL_GRADIENT, LocalAxes
 from remodel_fenicsx.model.energy import TURNED_OVER
-from remodel_fenicsx.model.tensors import Array, Flags
+from remodel_fenicsx.model.tensors import Array, Flags, stretch_tensor
 from remodel_fenicsx.scene import Scene, SceneError
 from remodel_fenicsx.schema.settings import Cells, Turnover, in_region
 from remodel_fenicsx.state import State, UnitCells
@@ -127,7 +127,7 @@ def natural_gradient(
     fibres: Fibres = NO_FIBRES,
 ) -> tuple[Array, ClosedRing | None]:
     """Return G of the natural configuration (elements, points, 3, 3); the closed ring or None."""
-    from remodel_fenicsx.body.wall import gradient, prestretch
+    from remodel_fenicsx.body.wall import prestretch
     from remodel_fenicsx.model.residual_stress import close_ring, fresh_stretches
 
     natural, shape = scene.natural, scene.geometry
@@ -177,7 +177,7 @@ def natural_gradient(
             chosen = domain.element_region == domain.regions[name] if name else slice(None)
             fresh[chosen] = fresh_stretches(properties.tissue)
         stretches *= fresh
-    return gradient(stretches, local_axes.axes).reshape(*quadrature.shape, 3, 3), ring
+    return stretch_tensor(stretches, local_axes.axes).reshape(*quadrature.shape, 3, 3), ring
 
 
 def check_files(scene: Scene) -> str:

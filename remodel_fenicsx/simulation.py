@@ -22,6 +22,7 @@ from remodel_fenicsx.initial import (
     meshed,
     natural_gradient,
 )
+from remodel_fenicsx.model.energy import TURNED_OVER
 from remodel_fenicsx.results.columns import Observer
 from remodel_fenicsx.scene import Scene, SceneError
 from remodel_fenicsx.schema.settings import Remodeling, Solver
@@ -275,7 +276,7 @@ def reset_simulation(simulation: Simulation, start: Snapshot, scene: Scene) -> b
     must_rebuild = has_variable_steps or kinematics.grows or scene.solver.unstable == "stop"
     if (
         must_rebuild
-        or parameters.keys() != varies.keys()
+        or parameters.keys() - TURNED_OVER != varies.keys()
         or any(varies[name] and not isinstance(parameters[name], Function) for name in varies)
     ):
         return False

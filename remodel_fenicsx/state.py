@@ -657,8 +657,9 @@ class Parameters:
     """
 
     def __init__(self, tissue: Tissue, cells: UnitCells):
-        self.given, self.quadrature = tissue, cells.quadrature
-        quadrature, mesh = cells.quadrature, cells.quadrature.mesh
+        self.given = tissue
+        self.quadrature = quadrature = cells.quadrature
+        mesh = quadrature.mesh
         if tissue.elastin_axial is not None:
             axes = quadrature.function("elastin_axes", (3, 3))
             quadrature.values(axes, (3, 3))[:] = cells.local_axes.axes
@@ -670,7 +671,7 @@ class Parameters:
         )
         self.compiled = with_kernels(self.tissue, mesh.comm)
         values = list(self.tissue.parameters.values())
-        self._largest: CachedValue[Tissue] = CachedValue(quadrature.mesh.comm, *values)
+        self._largest: CachedValue[Tissue] = CachedValue(mesh.comm, *values)
         self._at_points: CachedValue[Tissue] = CachedValue(None, *values)
 
     def largest(self) -> Tissue:

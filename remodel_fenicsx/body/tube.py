@@ -253,6 +253,18 @@ def _of_the_end(name: str, m: Any) -> float:
 def _of_rings(release: str, m: Any) -> float:
     """Return `cut` or `unloaded_stretch` of the tube with its current cells. Collective."""
     from remodel_fenicsx.model import residual_stress
+
+    arguments = m.cached_for_step("rings", lambda: _rings(m))
+    try:
+        return float(getattr(residual_stress, release)(*arguments))
+    except ArithmeticError as error:
+        if m.domain.comm.rank == 0:
+            log.warning("time %g: no equilibrium without loads: %s", m.step.time, error)
+        return float("nan")
+
+
+def _rings(m: Any) -> tuple[object, ...]:
+    """Return the arguments of `cut`: tissue, rings, radii of elements, closed ring. Collective."""
     from remodel_fenicsx.model.residual_stress import Rings, means_through
 
     state, stepper = m.state, m.observer.stepper
@@ -284,13 +296,8 @@ def _of_rings(release: str, m: Any) -> float:
         means[:, 2:], [3, 6], axis=1
     )
     rings = Rings(radii, volumes * density, changed * at_first(radii), squared)
-    try:
-        tissue = replace(tissue, **dict(zip(turned, turnover.T, strict=True)))
-        return float(getattr(residual_stress, release)(tissue, rings, edges, closed))
-    except ArithmeticError as error:
-        if comm.rank == 0:
-            log.warning("time %g: no equilibrium without loads: %s", m.step.time, error)
-        return float("nan")
+    tissue = replace(tissue, **dict(zip(turned, turnover.T, strict=True)))
+    return tissue, rings, edges, closed
 
 
 def _elements_through(domain: Domain, degree: int) -> tuple[Array, Array]:

@@ -130,11 +130,6 @@ def prestretch(natural: Natural, local_axes: LocalAxes, domain: Domain) -> Array
     return stretches
 
 
-def gradient(stretches: Array, axes: Array) -> Array:
-    """Return G (..., 3, 3) of stretches (..., 3) along axes, rows (..., 3, 3)."""
-    return np.swapaxes(axes, -1, -2) @ (stretches[..., None] * axes)
-
-
 # ---------------------------------------------------------------- bodies with inner and outer face
 # Measurements in the wall, and its local axes on any mesh.
 

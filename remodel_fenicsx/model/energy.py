@@ -571,6 +571,11 @@ class Tissue:
         around, along = self.elastin_circumferential, self.elastin_axial
         return [1.0, 1.0, 1.0] if along is None else [around, along, 1 / (around * along)]
 
+    @property
+    def elastin_prestretch(self) -> Array:
+        """Prestretches `elastin_stretches` of numbers or arrays as one array, (..., 3)."""
+        return np.stack(np.broadcast_arrays(*self.elastin_stretches), axis=-1)
+
     def matrix_gradient(self, deformation_gradient: UflOrArray) -> UflOrArray:
         """Return F_m = F G_e, the deformation gradient of the matrix.
 
@@ -584,8 +589,7 @@ class Tissue:
             return F
         axes = AXES_ON_THE_RADIUS if self.elastin_axes is None else self.elastin_axes
         if is_array(F):
-            stretches = np.stack(np.broadcast_arrays(*self.elastin_stretches), axis=-1)
-            return F @ np.einsum("...i,...ij,...ik->...jk", stretches, axes, axes)
+            return F @ tensors.stretch_tensor(self.elastin_prestretch, axes)
         directions = enumerate(self.elastin_stretches)
         return ufl.dot(F, sum(s * ufl.outer(axes[i, :], axes[i, :]) for i, s in directions))
 

@@ -132,6 +132,11 @@ def eigen(tensors: Array) -> tuple[Array, Array]:
     return values, vectors
 
 
+def stretch_tensor(stretches: Array, axes: Array) -> Array:
+    """Return the tensors (..., 3, 3) with stretches (..., 3) along axes, rows (..., 3, 3)."""
+    return np.swapaxes(axes, -1, -2) @ (stretches[..., None] * axes)
+
+
 def rotated(tensors: Array, vectors: Array) -> Array:
     """Return Q^T A Q, the components in the basis of the columns of Q."""
     return np.swapaxes(vectors, -1, -2) @ tensors @ vectors

@@ -23,7 +23,6 @@ from remodel_fenicsx.fem import compat, jit
 from remodel_fenicsx.fem.assembly import integral, allreduce
 from remodel_fenicsx.fem.quadrature import Quadrature
 from remodel_fenicsx.model.drivers import DRIVERS
-from remodel_fenicsx.model.energy import Stresses
 from remodel_fenicsx.schema.tables import SceneError, format_value
 from remodel_fenicsx.solver.equilibrium import Equilibrium, PointStresses
 
@@ -178,14 +177,16 @@ class Measurement:
             # the pass needs the same tensor
             return stepper.remodeling.driving_tensor()[1].reshape(*self.quadrature.shape, 3, 3)
 
-        return self._cauchy_stress("cauchy stress", lambda stresses: stresses)
+        return self._cauchy_stress()
 
-    def _cauchy_stress(self, key: str, part: Callable[[Stresses], Any]) -> Array:
+    def _cauchy_stress(self, of_collagen: bool = False) -> Array:
         def compiled() -> tuple[PointStresses, jit.PointValues]:
             stresses = PointStresses(self.state, self.observer.stepper.tissue)
-            return stresses, jit.expression(part(stresses.ufl).cauchy, self.quadrature.points)
+            part = stresses.ufl.collagen if of_collagen else stresses.ufl
+            assert part is not None
+            return stresses, jit.expression(part.cauchy, self.quadrature.points)
 
-        stresses, expression = self.cached(key, compiled)
+        stresses, expression = self.cached(("cauchy stress", of_collagen), compiled)
         stresses.refresh()
         return self.quadrature.evaluate(expression, (3, 3))
 
@@ -200,7 +201,7 @@ class Measurement:
         stepper = self.observer.stepper
         if stepper.tissue.chain is None:
             return np.zeros_like(self.wall_stress)
-        return self._in_the_wall(self._cauchy_stress("collagen", lambda s: s.collagen))
+        return self._in_the_wall(self._cauchy_stress(of_collagen=True))
 
     def _in_the_wall(self, stress: Array) -> Array:
         cells = self.state.cells
@@ -211,10 +212,10 @@ class Measurement:
     def elastin_stretches(self) -> Array:
         """Stretches F G G_e around, along and across the wall, (elements, points, 3)."""
         tissue = self.equilibrium.parameters.at_points()
-        cells, shape = self.state.cells, self.quadrature.shape
+        cells = self.state.cells
         moved = np.einsum("...ij,...kj->...ki", self.state.elastic(self.F), cells.local_axes.axes)
-        prestretch = [np.broadcast_to(s, shape[0] * shape[1]) for s in tissue.elastin_stretches]
-        return np.linalg.norm(moved, axis=-1) * np.stack(prestretch, axis=-1).reshape(*shape, 3)
+        stretches = np.linalg.norm(moved, axis=-1)
+        return (stretches.reshape(-1, 3) * tissue.elastin_prestretch).reshape(stretches.shape)
 
     @cached_property
     def fibre_angle(self) -> Array:

@@ -24,7 +24,6 @@ from remodel_fenicsx.fem.assembly import (
     allreduce,
     second_derivative,
 )
-from remodel_fenicsx.fem.kinematics import NaturalConfiguration
 from remodel_fenicsx.model.cells import UnitCell
 from remodel_fenicsx.model.energy import (
     Stresses,
@@ -127,8 +126,7 @@ class PointStresses:
         kinematics = state.kinematics
         # Amounts refer to the volume at the start, stresses to the present volume.
         if kinematics.grows:
-            assert isinstance(kinematics, NaturalConfiguration)
-            self.ufl = self.ufl.over(kinematics.volume_ratio())
+            self.ufl = self.ufl.over(kinematics.volume_ratio())  # type: ignore[attr-defined]
 
     def refresh(self) -> None:
         """Update what the expressions need in addition to F from the present unknowns and cells."""

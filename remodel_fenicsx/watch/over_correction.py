@@ -115,9 +115,12 @@ class OverCorrection(WarnsOnce):
         vector, r0 = self.state.unknown.x, parameters.largest().end_to_end_length
         scale = np.sqrt(quadrature.owned(quadrature.volumes) / quadrature.volume)[..., None] / r0**2
         bodies = np.array([vector.array, *self._body.values])
-        of_body = bodies[:, : self.state.number_of_owned_unknowns]
         cells_swing = self._swing(times, cells[:, : len(scale)], scale)
-        body_swing = self._swing(times, of_body, np.array(1 / (dolfinx.la.norm(vector) or 1.0)))
+        body_swing = self._swing(
+            times,
+            bodies[:, : self.state.number_of_owned_unknowns],
+            np.array(1 / (dolfinx.la.norm(vector) or 1.0)),
+        )
         self.swings = {"growing": cells_swing, "sustained": body_swing}
         tells, overshoots = self._is_pass_oscillation(step, cells, times), False
         for (name, swing), (factor, passes) in zip(

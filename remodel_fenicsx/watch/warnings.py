@@ -375,6 +375,8 @@ class FrontsInLayers(ShapeWarning):
 
     def check(self, step: Step) -> str:
         """Return a warning for layers with a front in most elements. Collective."""
+        if not self.shape.angle_layers:
+            return ""
         cells, quadrature = self.state.cells, self.quadrature
         depths = cells.local_axes.nodal_depth[geometry_dofmap(quadrature.mesh)]
         angles = self.shape.fibre_angle(

@@ -207,9 +207,7 @@ def as_programs_write(points: Any, triangles: Any) -> dict[str, bytes]:
     }
 
 
-def test_files_of_many_programs_are_the_same_surface(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_files_of_many_programs_are_the_same_surface(tmp_path: Path) -> None:
     points, triangles = tube()
     files = as_programs_write(points, triangles)
     named = dict.fromkeys(["triangles", "points", "file"], points[:, 2])

@@ -175,22 +175,19 @@ def test_processes_of_srun_that_share_no_mpi_are_refused(tmp_path: Path) -> None
     )
 
 
+def wall_on(folder: Path, **counts: int) -> tuple[Path, list[str]]:
+    """A surface with so many triangles, and the words that ask for a wall on it."""
+    points, triangles = tube(**counts)
+    file = folder / "lumen.vtp"
+    pyvista.PolyData.from_regular_faces(points, triangles).save(file)
+    options = f"--thickness 0.3 --size 0.3 -o {folder / 'wall.msh'}"
+    return file, [*COMMAND[:3], "wall", str(file), *options.split()]
+
+
 def test_a_wall_on_a_large_surface_says_what_it_does_and_ends_at_once(tmp_path: Path) -> None:
     """While Gmsh, which hears no signals, divides 204,800 triangles."""
-    points, triangles = tube(around=640, along=160)
-    file = tmp_path / "lumen.vtp"
-    pyvista.PolyData.from_regular_faces(points, triangles).save(file)
-    words = [
-        "wall",
-        str(file),
-        "--thickness",
-        "0.3",
-        "--size",
-        "0.3",
-        "-o",
-        str(tmp_path / "wall.msh"),
-    ]
-    process = subprocess.Popen([*COMMAND[:3], *words], stderr=subprocess.PIPE, text=True)
+    file, words = wall_on(tmp_path, around=640, along=160)
+    process = subprocess.Popen(words, stderr=subprocess.PIPE, text=True)
     assert process.stderr is not None and "remeshing 204800 triangles" in process.stderr.readline()
     process.terminate()
     _, said = process.communicate(timeout=5)
@@ -201,28 +198,16 @@ def test_a_wall_on_a_large_surface_says_what_it_does_and_ends_at_once(tmp_path: 
 
 def test_a_limit_of_files_is_no_fault_of_a_surface(tmp_path: Path) -> None:
     """Below the size of the surface, and below that of the mesh."""
-    points, triangles = tube()
-    file = tmp_path / "lumen.vtp"
-    pyvista.PolyData.from_regular_faces(points, triangles).save(file)
-    words = [
-        "wall",
-        str(file),
-        "--thickness",
-        "0.3",
-        "--size",
-        "0.3",
-        "-o",
-        str(tmp_path / "wall.msh"),
-    ]
+    file, words = wall_on(tmp_path)
     for blocks in (20, 200):
-        limited = ["bash", "-c", f'ulimit -f {blocks}; exec "$0" "$@"', *COMMAND[:3], *words]
+        limited = ["bash", "-c", f'ulimit -f {blocks}; exec "$0" "$@"', *words]
         done = subprocess.run(limited, capture_output=True, text=True, timeout=100)
         assert done.returncode == 5, done.stderr
         assert "lumen.vtp" not in done.stderr and "Traceback" not in done.stderr
     assert list(tmp_path.iterdir()) == [file]
 
 
-def test_a_rank_does_not_wait_for_a_second_signal(tmp_path: Path) -> None:
+def test_a_rank_does_not_wait_for_a_second_signal() -> None:
     """mpirun gives its ranks a quarter of a second between SIGTERM and SIGKILL: all of it is for the checkpoint."""
     program = """
 import os, signal, time

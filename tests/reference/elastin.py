@@ -72,7 +72,7 @@ class ElasticWall(Wall):
 
     def __post_init__(self) -> None:
         if self.opening_angle:
-            raise ValueError("a wall with elastin and an opening angle has no reference here")
+            raise ValueError("no reference for elastin with an opening angle")
         super().__post_init__()
         self.G = np.outer(fresh(self.material, self.prestretch), np.ones(self.points))
 

@@ -15,11 +15,12 @@ from typing import Any
 import numpy as np
 import pytest
 
-from remodel_fenicsx import Scene, SceneError, cli, preset_scene, read_scene
+from remodel_fenicsx import Scene, SceneError, Simulation, cli, preset_scene, read_scene
 from remodel_fenicsx.schema.settings import STRESS_UNITS
+from remodel_fenicsx.simulation import reset_simulation
 from remodel_fenicsx.studies.fit import Problem, data_warnings, fit, minimised, read_measurements
 from tests.conftest import Refused, forked_children
-from tests.runs import rows_of
+from tests.runs import last_row, rows_of
 from tests.tables import rows
 
 ROOT, FITS = Path(__file__).parents[2], Path(__file__).with_name("fits")
@@ -581,3 +582,28 @@ def tube_without_turnover(scene: Scene) -> Scene:
             "time.step": 4.0,
         }
     )
+
+
+STRETCHED = {"material.elastin.prestretch": [1.0, 1.2]}
+
+
+@pytest.mark.parametrize(
+    ("before", "after", "stays"),
+    [
+        ({"remodeling.turnover": {"time": 40.0, "volume": 0.0}}, {"material.lame_mu": 4.0}, True),
+        (STRETCHED, {"material.elastin.prestretch.1": 1.3}, True),
+        ({}, STRETCHED, False),
+        (STRETCHED, {"material.elastin.prestretch.1": 1.0}, False),
+    ],
+)
+def test_a_simulation_stays_where_it_can_take_the_numbers(
+    before: dict[str, Any], after: dict[str, Any], stays: bool
+) -> None:
+    """It then has the rows of one that is built with them."""
+    scene = preset_scene("consistent", "tube").with_values(
+        {"cells.initial": "isotropic", "model.kinematics": "radial", "time.end": 2.0} | before
+    )
+    simulation, changed = Simulation(scene), scene.with_values(after)
+    assert reset_simulation(simulation, simulation.state.snapshot(), changed) == stays
+    *_, step = simulation.steps()
+    assert not stays or step.row["inner_radius"] == pytest.approx(last_row(changed)["inner_radius"])

@@ -88,7 +88,7 @@ def test_a_tendon_is_a_column_with_a_free_end() -> None:
 
 
 # ---------------------------------------------------------------- against the whole body
-def test_the_whole_tube_loses_its_stability_where_the_ray_says_so(caplog: Any) -> None:
+def test_the_whole_tube_loses_its_stability_where_the_ray_says_so() -> None:
     """Two modes, x and y, between pressures at which the estimate is 0.8 and 1.1."""
     counts, shares = [], []
     for pressure in (0.26, 0.32):
