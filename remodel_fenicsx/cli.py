@@ -298,6 +298,9 @@ WITH = f"""
     --with FILE.py*  Load a Python file with custom components before reading the scene; repeatable
         (or {EXTENSIONS})."""
 QUIET = "-q --quiet  Show warnings only, no progress."
+SCHEDULER = """
+    --scheduler ADDRESS  Run on the workers of a Dask scheduler: its address, as tcp://HOST:8786, or
+        its scheduler file; docs/howto_ranks.md explains it."""
 RUN_FOLDER = "folder DIR  The folder of a run."
 SCENE_AND_CHANGES = """
     file SCENE  The scene file (TOML); docs/scene.md lists its keys.
@@ -586,6 +589,7 @@ def _run_study(study: Callable[..., tuple[Path, StudyResult]], *wishes: object) 
     --seed SEED = 1  Seed of the Latin hypercube (default: %(default)s).
     """,
     _study_options("sweep"),
+    SCHEDULER,
     needs=COMPUTES,
 )
 def _sweep(options: argparse.Namespace) -> int:
@@ -597,7 +601,7 @@ def _sweep(options: argparse.Namespace) -> int:
     points = (
         study.latin_hypercube(axes, options.latin, options.seed) if is_sampled else study.grid(axes)
     )
-    wishes = options.output, options.jobs, options.quiet, is_sampled
+    wishes = options.output, options.jobs, options.quiet, is_sampled, options.scheduler
     return _run_study(study.sweep, options.scene, points, *wishes)
 
 
@@ -606,15 +610,15 @@ def _sweep(options: argparse.Namespace) -> int:
     SCENE_AND_CHANGES,
     "--seeds N = 32  Number of seeds, at least 2 (default: %(default)s).",
     _study_options("ensemble"),
+    SCHEDULER,
     needs=COMPUTES,
 )
 def _ensemble(options: argparse.Namespace) -> int:
     """Run a scene of random cells with many seeds."""
     from remodel_fenicsx.studies.sweep import ensemble
 
-    return _run_study(
-        ensemble, options.scene, options.output, options.seeds, options.jobs, options.quiet
-    )
+    wishes = options.jobs, options.quiet, options.scheduler
+    return _run_study(ensemble, options.scene, options.output, options.seeds, *wishes)
 
 
 @command(
@@ -625,15 +629,15 @@ def _ensemble(options: argparse.Namespace) -> int:
         repeat the command with a larger budget to resume.
     """,
     _study_options("trade"),
+    SCHEDULER,
     needs=COMPUTES,
 )
 def _trade(options: argparse.Namespace) -> int:
     """Run a scene with coarse and fine settings, and show the cost and error of each."""
     from remodel_fenicsx.studies.trade import trade
 
-    return _run_study(
-        trade, options.scene, options.output, options.budget, options.jobs, options.quiet
-    )
+    wishes = options.jobs, options.quiet, options.scheduler
+    return _run_study(trade, options.scene, options.output, options.budget, *wishes)
 
 
 @command(

@@ -19,6 +19,7 @@ import signal
 import subprocess
 import sys
 import tempfile
+import threading
 import time
 import traceback
 import warnings
@@ -28,7 +29,6 @@ from types import SimpleNamespace
 from typing import Any
 
 from remodel_fenicsx.system import children
-from remodel_fenicsx.system.children import SERVE
 
 # before a program: a mesh of few elements for every tube
 COARSE = "from remodel_fenicsx.body import tube; tube.PAPER = (8, 4, 1)\n"
@@ -117,21 +117,18 @@ def end_forks() -> None:
 class ForkedChild:
     """Stands for subprocess.Popen in `remodel_fenicsx.system.children`, for commands that nobody stops."""
 
-    def __init__(self, command: Sequence[str], stdout: Any, **_: Any):
-        words = command[command.index("remodel_fenicsx.cli") + 1 :]
+    one_at_a_time = threading.Lock()  # threads of a study ask
+
+    def __init__(self, *_: Any, **__: Any):
         self.returncode: int | None = None
-        if words == [SERVE]:  # a worker, which is asked for one command after the other
-            answers, self._answers = os.pipe()
-            self.stdin, self.stdout = self, os.fdopen(answers)
-            return
-        done = forked("remodel-fenicsx", *words)
-        stdout.write(done.stdout + done.stderr)
-        self.returncode = done.returncode
+        answers, self._answers = os.pipe()
+        self.stdin, self.stdout = self, os.fdopen(answers)
 
     def write(self, request: str) -> None:
         """Do what a worker is asked for, and answer."""
         words, messages = json.loads(request)
-        done = forked("remodel-fenicsx", *words)
+        with self.one_at_a_time:
+            done = forked("remodel-fenicsx", *words)
         Path(messages).write_text(done.stdout + done.stderr)
         os.write(self._answers, f"{done.returncode}\n".encode())
 

@@ -21,8 +21,11 @@ from numpy.typing import NDArray
 from remodel_fenicsx.errors import RemodelError
 from remodel_fenicsx.system.environment import check_extensions
 from remodel_fenicsx.system.files import (
+    LOCK,
+    SCENE,
     ClosedAtEnd,
     check_regular,
+    lock_holder,
     open_own,
     partial_path,
     read_regular,
@@ -71,7 +74,7 @@ def kept_times(times: Numbers, most: int) -> Numbers:
 
 Array = NDArray[np.float64]
 
-HISTORY, SCENE = "history.csv", "scene.toml"
+HISTORY = "history.csv"
 FIELDS, CHAIN_LINES = "fields.vtkhdf", "fields_chains.vtkhdf"
 LOG = "run.log"
 # bytes: the million steps that a scene may have, of a thousand characters each
@@ -413,8 +416,6 @@ def _in_words(times: Array) -> str:
 # ---------------------------------------------------------------- who writes in a folder
 # One run at a time, and others can see which.
 
-LOCK = "run.lock"
-
 
 class FolderTaken(RemodelError, ValueError):
     """The requested folder is not empty, or a run writes in it.
@@ -463,22 +464,6 @@ class RunLock(ClosedAtEnd):
         """Release the lock and remove its file."""
         self._path.unlink(missing_ok=True)
         os.close(self._descriptor)
-
-
-def lock_holder(folder: Path) -> tuple[str | None, bool]:
-    """Return text on the process that holds, or held, a folder's lock, and whether it lives."""
-    try:
-        descriptor = open_own(folder / LOCK, os.O_RDONLY)
-    except FileNotFoundError:
-        return None, False
-    with open(descriptor, "rb") as file:
-        try:
-            fcntl.flock(descriptor, fcntl.LOCK_SH | fcntl.LOCK_NB)
-            lives = False
-        except BlockingIOError:
-            lives = True
-        words = file.read(4096).decode(errors="replace").strip()
-    return words or None, lives  # none: just being written
 
 
 def is_unused(folder: Path) -> bool:

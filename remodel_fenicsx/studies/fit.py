@@ -55,7 +55,7 @@ from remodel_fenicsx.studies.study import (
     made_with,
     panels,
 )
-from remodel_fenicsx.system.children import PART, Worker
+from remodel_fenicsx.system.children import PART
 from remodel_fenicsx.system.files import ForeignFileError, check_no_link, read_regular, write_whole
 from remodel_fenicsx.system.terminal import buffer_log, open_log, muted_warnings
 from remodel_fenicsx.unloading import PASSIVE
@@ -687,11 +687,11 @@ class Part(Run):
         """Return False: a part is not recorded, but its evaluated points are known."""
         return False
 
-    def begin(self, worker: Worker) -> None:
-        """Start the part in a worker."""
+    def words(self) -> list[str]:
+        """Write the task; return the command that does it."""
         file = self.sibling_path(".pickle")
         file.write_bytes(pickle.dumps(self.work))
-        worker.begin([PART, str(file)], self.sibling_path(".txt"))
+        return [PART, str(file)]
 
     @property
     def answer(self) -> OptimizeResult:

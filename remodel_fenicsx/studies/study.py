@@ -14,8 +14,10 @@ import textwrap
 import time as clock
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping, Sequence
+from concurrent.futures import FIRST_COMPLETED, Future, wait
 from contextlib import closing
 from dataclasses import dataclass
+from functools import cached_property, partial
 from pathlib import Path
 from typing import Any, SupportsFloat, TypeVar
 
@@ -39,14 +41,13 @@ from remodel_fenicsx.results.recording import (
     read_history,
     unit_of,
     words,
-    lock_holder,
 )
 from remodel_fenicsx.running import with_stored_files
 from remodel_fenicsx.scene import Scene
 from remodel_fenicsx.scene.scene import SceneError
 from remodel_fenicsx.initial import resolve_auto_settings
 from remodel_fenicsx.system.environment import versions
-from remodel_fenicsx.system.children import Worker, cores, wait_for_one
+from remodel_fenicsx.system.children import Cluster, Threads
 from remodel_fenicsx.system.files import (
     check_no_link,
     make_own_folder,
@@ -311,15 +312,13 @@ class Run:
         """Read the recorded history."""
         return read_history(self.folder)
 
-    def begin(self, worker: Worker) -> None:
-        """Start the run in a worker, or resume it from its folder."""
+    def words(self) -> list[str]:
+        """Write the scene next to the folder; return the command that begins the run."""
         make_own_folder(self.folder.parent)
         check_no_link(self.folder)
-        scene, words = self.sibling_path(".toml"), ["--resume", str(self.folder)]
-        if not (self.folder / SCENE).exists():
-            write_whole(scene, self.scene.to_toml().encode())
-            words = [str(scene), "-o", str(self.folder)]
-        worker.begin(["run", *words, "-q", "--no-report"], self.sibling_path(".txt"))
+        scene = self.sibling_path(".toml")
+        write_whole(scene, self.scene.to_toml().encode())
+        return ["run", str(scene), "-o", str(self.folder), "-q", "--no-report"]
 
 
 def _same(recording: RecordedRun, wanted: Scene) -> bool:
@@ -350,21 +349,28 @@ class Study:
         scenes: Mapping[str, Scene],
         jobs: int | None = None,
         quiet: bool = True,
+        scheduler: str | None = None,
     ):
         self.name, self.scene = name, scene
-        self.jobs, self.quiet = jobs or cores(), quiet
+        self.jobs, self.quiet, self.scheduler = jobs, quiet, scheduler
         self.folder = Path(folder or Path("results") / f"{scene.name}-{name}")
-        self.runs = [Run(run, changed, self.folder / run) for run, changed in scenes.items()]
+        place = self.folder.absolute()  # Processes on other machines have other working folders.
+        self.runs = [Run(run, changed, place / run) for run, changed in scenes.items()]
         self.failed: dict[str, str] = {}
         self.deadline = math.inf
-        self._waiting: list[Run] = []
-        self._running: dict[Worker, Run] = {}
-        self._idle: list[Worker] = []
+        self._running: dict[Future[tuple[int, str]], Run] = {}
+
+    @cached_property
+    def _pool(self) -> Threads:
+        """Threads, or workers of a scheduler, that wait for the runs; made when runs are left."""
+        if self.scheduler is None:
+            return Threads(self.jobs)
+        return Cluster(self.scheduler, self.folder, self.jobs)
 
     def close(self) -> None:
-        """End the processes of all workers."""
-        for worker in [*self._running, *self._idle]:
-            worker.stop()
+        """End all runs and processes."""
+        if "_pool" in vars(self):
+            self._pool.close(self._running)
 
     def run_and_write(self, answer: Callable[[], AnyResult]) -> tuple[Path, AnyResult]:
         """Do all runs, compute the result and write it; return the folder and the result."""
@@ -383,21 +389,26 @@ class Study:
 
     def run_all(self) -> None:
         """Do all incomplete runs; `failed` gets the last output of failed and corrupt ones."""
-        self._waiting = [run for run in self.runs if self._is_left(run)]
+        waiting = [run for run in self.runs if self._is_left(run)]
         self.update()
         pausing = False
         with StopRequest() as stop, Line(f"{self.scene.name} {self.name}", self.quiet) as line:
-            while (self._waiting or self._running) and clock.monotonic() < self.deadline:
+            while (waiting or self._running) and clock.monotonic() < self.deadline:
                 if stop.number:
                     raise Interrupted(stop.number)
                 if stop.pause and not pausing:
                     pausing = True
-                    self._waiting.clear()
-                    for worker in self._running:  # Each run ends after its current step.
-                        worker.process.send_signal(PAUSE)
-                self._begin()
+                    waiting.clear()
+                    # Each run ends after its current step.
+                    self._pool.everywhere(partial(self._pool.members.send, PAUSE))
+                while waiting and len(self._running) < self._pool.places():
+                    run = waiting.pop(0)
+                    member = self._pool.executor.submit(
+                        self._pool.members.run, run.folder, run.words()
+                    )
+                    self._running[member] = run
                 self._collect(pausing)
-                line.show(self._progress())
+                line.show(self._progress(len(waiting)))
         if pausing:
             raise Interrupted(PAUSE)
 
@@ -409,38 +420,19 @@ class Study:
             self.failed[run.name] = str(error)
             return False
 
-    def _begin(self) -> None:
-        """Start runs until their number is that of the jobs."""
-        for run in list(self._waiting):
-            if len(self._running) >= self.jobs:
-                return
-            # Another command is running it, or a killed one that is still ending.
-            if run.folder.is_dir() and lock_holder(run.folder)[1]:
-                continue
-            self._waiting.remove(run)
-            if self._is_left(run):
-                worker = self._idle.pop() if self._idle else Worker()
-                self._running[worker] = run
-                run.begin(worker)
-
     def _collect(self, pausing: bool) -> None:
         """Collect the runs that have ended."""
-        wait_for_one(self._running, POLL)
-        for worker, run in list(self._running.items()):
-            code = worker.poll()
-            if code is None:
-                continue
-            del self._running[worker]
+        for member in wait(self._running, POLL, FIRST_COMPLETED).done:
+            run = self._running.pop(member)
+            code, words = self._pool.result(member)
             # -PAUSE: the signal came before Python had installed its handler.
             if code != 0 and not (pausing and code in (PAUSED, -PAUSE)):
-                self.failed[run.name] = worker.last_output()
-            if worker.is_alive:
-                self._idle.append(worker)
+                self.failed[run.name] = words
             self.update()
 
-    def _progress(self) -> str:
+    def _progress(self, waiting: int) -> str:
         """Return the number of runs that have ended, and the names of the current ones."""
-        done = len(self.runs) - len(self._waiting) - len(self._running)
+        done = len(self.runs) - waiting - len(self._running)
         under_way = ", ".join(run.name for run in self._running.values())
         text = f"{done} of {len(self.runs)} runs done"
         return f"{text}; under way: {under_way}" if under_way else text

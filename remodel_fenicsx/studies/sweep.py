@@ -216,6 +216,7 @@ def sweep(
     jobs: int | None = None,
     quiet: bool = True,
     sampled: bool = False,
+    scheduler: str | None = None,
 ) -> tuple[Path, Sweep]:
     """Run a scene at each point. Points without a valid scene raise, or fail if `sampled`."""
     if not FEWEST_RUNS <= len(points) <= MOST_RUNS:
@@ -231,7 +232,8 @@ def sweep(
             refused[name] = str(error)
             if not sampled or len(refused) > len(points) - FEWEST_RUNS:
                 raise
-    return _answered(Sweep, named, refused, Study("sweep", scene, folder, scenes, jobs, quiet))
+    study = Study("sweep", scene, folder, scenes, jobs, quiet, scheduler)
+    return _answered(Sweep, named, refused, study)
 
 
 Swept = TypeVar("Swept", bound=Sweep)
@@ -361,6 +363,7 @@ def ensemble(
     seeds: int = 32,
     jobs: int | None = None,
     quiet: bool = True,
+    scheduler: str | None = None,
 ) -> tuple[Path, Ensemble]:
     """Run a scene with many consecutive seeds, starting from its own."""
     if seeds < FEWEST_RUNS:
@@ -380,4 +383,5 @@ def ensemble(
         name: scene.with_values({"output.fields": False, "name": name, **p})
         for name, p in points.items()
     }
-    return _answered(Ensemble, points, {}, Study("ensemble", scene, folder, scenes, jobs, quiet))
+    study = Study("ensemble", scene, folder, scenes, jobs, quiet, scheduler)
+    return _answered(Ensemble, points, {}, study)

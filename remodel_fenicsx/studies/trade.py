@@ -235,9 +235,10 @@ def trade(
     budget: float = 600.0,
     jobs: int | None = None,
     quiet: bool = True,
+    scheduler: str | None = None,
 ) -> tuple[Path, Trade]:
     """Run a scene with all settings, within a budget in seconds; compare each with the finest."""
-    study = _TradeStudy(scene, folder, budget, jobs, quiet)
+    study = _TradeStudy(scene, folder, budget, jobs, quiet, scheduler)
     return study.run_and_write(study.answer)
 
 

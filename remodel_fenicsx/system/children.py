@@ -2,97 +2,97 @@
 
 from __future__ import annotations
 
-import ctypes
 import errno
 import gc
 import importlib
 import io
 import json
+import logging
+import math
 import os
 import re
 import resource
 import select
 import signal
+import socket
 import subprocess
 import sys
 import sysconfig
+import threading
+import time as clock
 import types
-from collections.abc import Callable, Collection, Sequence
-from functools import partial
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
+from concurrent.futures import CancelledError, Executor, Future, ThreadPoolExecutor, wait
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import IO, TYPE_CHECKING, Any, cast
+from uuid import uuid4
 
 from remodel_fenicsx.errors import BAD_ENVIRONMENT, RemodelError, UnreadableFile
-from remodel_fenicsx.system.environment import extensions_for_children
-from remodel_fenicsx.system.files import open_own, read_regular
+from remodel_fenicsx.system.environment import EXTENSIONS, extensions_for_children, software
+from remodel_fenicsx.system.files import MOST_RUNS, SCENE, lock_holder, open_own, read_regular
+from remodel_fenicsx.system.interrupts import PAUSE
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
-SECONDS_TO_END = 30.0  # seconds until a worker is killed
-PARENT_DEATH_SIGNAL = 1  # PR_SET_PDEATHSIG of prctl(2)
-SERVE, PART = "serve", "fit-part"  # internal commands: of a worker, and of a parallel part of a fit
+SECONDS_TO_END = 30.0  # seconds until a process is killed, or workers of a scheduler are missed
+SECONDS_TO_CONNECT, POLL = 10.0, 0.5
+SERVE, PART = (
+    "serve",
+    "fit-part",
+)  # internal commands: of a process, and of a parallel part of a fit
+RANK_VARIABLES = re.compile(r"(OMPI_(?!MCA_(btl|mpi_))|PMIX?_|PRTE_|SLURM_)")
 
 
-class Worker:
+class WarmProcess:
     """A process that runs commands one after another, with modules and kernels loaded once."""
 
-    def __init__(self) -> None:
+    def __init__(self, variables: dict[str, str]) -> None:
+        # setpriv: SIGTERM if this process is killed. If it was killed before, the pipe has ended.
         # -P: import no module from the working folder, which may belong to somebody else.
-        command = [sys.executable, "-P", "-m", "remodel_fenicsx.cli", SERVE]
-        # SIGTERM if this process is killed. If it was killed before, the pipe has ended.
-        end_with_parent = partial(ctypes.CDLL(None).prctl, PARENT_DEATH_SIGNAL, signal.SIGTERM)
+        guard, module = "setpriv --pdeathsig TERM", f"-P -m remodel_fenicsx.cli {SERVE}"
         self.process = subprocess.Popen(
-            command,
-            env=environment_of_child(),
+            [*guard.split(), sys.executable, *module.split()],
+            env=environment_of_child() | variables,
             stdin=subprocess.PIPE,
             stdout=subprocess.PIPE,
             text=True,
             bufsize=1,
-            preexec_fn=end_with_parent,
         )
         self._tasks, self._answers = cast(IO[str], self.process.stdin), cast(
             IO[str], self.process.stdout
         )
-        self.messages: Path | None = None
-        self.is_at_work = False
 
     def begin(self, arguments: Sequence[str], messages: Path) -> None:
         """Start a command; its output goes to a new file."""
         messages.unlink(missing_ok=True)  # The old entry may be a link.
         os.close(open_own(messages, os.O_WRONLY | os.O_CREAT | os.O_EXCL))
-        self.messages, self.is_at_work = messages, True
-        # Otherwise `poll` reports the end. PETSc, if loaded, aborts when a pipe closes.
+        # Otherwise `result` reports the end. PETSc, if loaded, aborts when a pipe closes.
         if self.is_alive:
             self._tasks.write(json.dumps([list(arguments), str(messages.absolute())]) + "\n")
 
-    def poll(self) -> int | None:
-        """Return the exit code of the command (negative: signal), or None while it runs."""
-        if not wait_for_one([self], 0.0):
-            return None
-        self.is_at_work, line = False, self._answers.readline()
+    def has_ended(self, seconds: float) -> bool:
+        """Wait at most this long for the end of the command; return whether it has ended."""
+        return bool(select.select([self._answers], [], [], seconds)[0])
+
+    def result(self, messages: Path) -> tuple[int, str]:
+        """Return the exit code of the command (negative: signal) and the last line it wrote."""
+        line = self._answers.readline()
         # The process has ended without an answer.
-        return int(line) if line else self.process.wait() or 1
+        code = int(line) if line else self.process.wait() or 1
+        if code < 0:
+            return code, f"killed by {signal.Signals(-code).name}"
+        said = last_line(messages.read_text(errors="replace"))
+        return code, said.removeprefix("remodel-fenicsx: ")
 
     @property
     def is_alive(self) -> bool:
-        """Whether the worker accepts another command."""
+        """Whether the process accepts another command."""
         return self.process.poll() is None
 
-    def last_output(self) -> str:
-        """Return the last line of the command's output, or the signal that killed the process."""
-        code = self.process.poll()
-        if code is not None and code < 0:
-            return f"killed by {signal.Signals(-code).name}"
-        assert self.messages is not None
-        return last_line(self.messages.read_text(errors="replace")).removeprefix(
-            "remodel-fenicsx: "
-        )
-
     def stop(self) -> None:
-        """Stop the worker; kill it after `SECONDS_TO_END`."""
-        if self.is_at_work:
-            self.process.terminate()
+        """Let the process end after its command; kill it after `SECONDS_TO_END`."""
         self._tasks.close()
         try:
             self.process.wait(timeout=SECONDS_TO_END)
@@ -102,13 +102,8 @@ class Worker:
         self._answers.close()
 
 
-def wait_for_one(workers: Collection[Worker], seconds: float) -> bool:
-    """Wait at most this long for an answer of a worker; return whether there is one."""
-    return bool(select.select([worker.process.stdout for worker in workers], [], [], seconds)[0])
-
-
 def serve(command: Callable[[Sequence[str]], int]) -> int:
-    """Run the commands that a `Worker` sends, until it closes the pipe; return the exit code."""
+    """Run the commands of a `WarmProcess` until it closes the pipe; return the exit code."""
     with os.fdopen(os.dup(1), "w") as answers:
         for line in sys.stdin:
             words, messages = json.loads(line)
@@ -128,6 +123,207 @@ def serve(command: Callable[[Sequence[str]], int]) -> int:
     return 0
 
 
+# ---------------------------------------------------------------- members of a study
+class SchedulerError(RemodelError):
+    """Scheduler that is lost, or that has no workers or unfit ones."""
+
+    exit_code = BAD_ENVIRONMENT
+
+
+class Members:
+    """Members of a study that run in this process; pickled, those of the reading process."""
+
+    def __init__(
+        self,
+        study: str = "",
+        folder: Path = Path(),
+        holder: str | None = None,  # process with the lock of the folder; None: this one
+        variables: dict[str, str] = {},
+        expected: Mapping[str, str] = {},  # software
+    ):
+        self._about = study, folder, holder, variables, expected
+        self._idle: list[WarmProcess] = []
+        self._at_work: list[WarmProcess] = []
+        self._lock = threading.Lock()
+        self._signal, self._deadline = 0, math.inf
+        self._is_fit = holder is None
+
+    def __reduce__(self) -> tuple[object, ...]:
+        return _members_here, self._about
+
+    def check(self) -> None:
+        """Raise unless this worker has folder, lock and software of the command."""
+        _, folder, holder, variables, expected = self._about
+        (name, lives), words = lock_holder(folder), None
+        present = software(variables[EXTENSIONS])
+        differing = [item for item, value in expected.items() if present[item] != value]
+        if name != holder:
+            words = f"does not see {folder}; the folder must be on a file system of all machines"
+        elif not lives:
+            words = f"{folder}: its file system keeps no lock between machines; mount it with flock"
+        elif differing:
+            words = f"has another {differing[0]} than this command; start the worker again with it"
+        if words:
+            raise SchedulerError(f"worker on {socket.gethostname()}: {words}")
+        self._is_fit = True
+
+    def run(self, folder: Path, words: Sequence[str]) -> tuple[int, str]:
+        """Begin a member with a command, or go on with it; return exit code and last words."""
+        if not self._is_fit:
+            self.check()
+        # Another command is running it, or a killed one that is still ending.
+        while not self._signal and folder.is_dir() and lock_holder(folder)[1]:
+            clock.sleep(POLL)
+            self._end_without_command()
+        if (folder / SCENE).exists():
+            words = ["run", "--resume", str(folder), "-q", "--no-report"]
+        messages = folder.with_name(f"{folder.name}.txt")
+        with self._lock:
+            if self._signal:
+                return -self._signal, ""
+            process = self._idle.pop() if self._idle else WarmProcess(self._about[3])
+            self._at_work.append(process)
+            process.begin(words, messages)
+        while not process.has_ended(POLL):
+            self._end_without_command()
+            if clock.monotonic() > self._deadline:
+                process.process.kill()
+        answer = process.result(messages)
+        with self._lock:
+            self._at_work.remove(process)
+            if process.is_alive:
+                self._idle.append(process)
+        return answer
+
+    def send(self, number: int) -> None:
+        """Send a signal to all members, now and later; kill them after a while unless they pause."""
+        with self._lock:
+            if number == self._signal:  # A second one would end them without a checkpoint.
+                return
+            self._signal = number
+            if number != PAUSE:
+                self._deadline = clock.monotonic() + SECONDS_TO_END
+            for process in self._at_work:
+                process.process.send_signal(number)
+
+    def end(self) -> None:
+        """End all processes; `run` waits for those at work."""
+        self.send(signal.SIGTERM)
+        _PRESENT.pop(self._about[0], None)
+        while self._idle:
+            self._idle.pop().stop()
+
+    def _end_without_command(self) -> None:
+        """End the members if the command that has begun them was killed."""
+        _, folder, holder, *_ = self._about
+        if holder and lock_holder(folder) != (holder, True):
+            self.end()
+
+
+_PRESENT: dict[str, Members] = {}  # of a worker, by study
+
+
+def _members_here(*about: Any) -> Members:
+    for other in list(_PRESENT.values()):
+        other._end_without_command()
+    return _PRESENT.setdefault(about[0], Members(*about))
+
+
+class Threads:
+    """Threads that wait for members of a study, which are processes of this machine."""
+
+    def __init__(self, jobs: int | None):
+        self.jobs, self.members = jobs or cores(), Members()
+        self.executor: Executor = ThreadPoolExecutor(self.jobs)
+
+    def places(self) -> int:
+        """Return how many members may run at a time."""
+        return self.jobs
+
+    def everywhere(self, call: Callable[[], None]) -> None:
+        """Call a method of the members wherever they run."""
+        call()
+
+    def result(self, member: Future[tuple[int, str]]) -> tuple[int, str]:
+        """Return exit code and last words of a member that has ended."""
+        return member.result()
+
+    def close(self, under_way: Collection[Future[tuple[int, str]]]) -> None:
+        """End all members and processes."""
+        self.everywhere(self.members.end)
+        wait(under_way, 2 * SECONDS_TO_END)
+        self.executor.shutdown()
+
+
+class Cluster(Threads):
+    """Workers of a Dask scheduler, each of which waits for members on its machine."""
+
+    def __init__(self, scheduler: str, folder: Path, jobs: int | None):
+        self._scheduler, self._most = scheduler, jobs or MOST_RUNS
+        if "://" not in scheduler and not Path(scheduler).is_file():
+            raise RemodelError(
+                f"--scheduler {scheduler}: no such file; must be an address, as "
+                "tcp://HOST:8786, or the file that dask scheduler --scheduler-file writes"
+            )
+        try:
+            from distributed import Client
+            from distributed.scheduler import KilledWorker
+        except ImportError as error:
+            raise SchedulerError(
+                f"--scheduler: {error}; pip install remodel-fenicsx[cluster]"
+            ) from error
+        logging.getLogger("distributed").setLevel(logging.CRITICAL + 1)
+        self._killed = KilledWorker
+        where = {"address" if "://" in scheduler else "scheduler_file": scheduler}
+        with self._asking("is not reached"):
+            self._client = Client(**where, timeout=SECONDS_TO_CONNECT, set_as_default=False)
+        variables = extensions_for_children()
+        about = uuid4().hex, folder.absolute(), lock_holder(folder)[0], variables
+        self.members = Members(*about, software(variables[EXTENSIONS]))
+        self.executor = self._client.get_executor(pure=False)
+        self.places()
+        self.everywhere(self.members.check)
+
+    def places(self) -> int:
+        """Return how many members may run at a time: the threads of all workers."""
+        with self._asking("has no workers"):
+            self._client.wait_for_workers(1, SECONDS_TO_END)
+        with self._asking():
+            return min(sum(self._client.nthreads().values()), self._most)
+
+    def everywhere(self, call: Callable[[], None]) -> None:
+        """Call a method of the members on all workers."""
+        with self._asking():
+            for answer in self._client.run(call, on_error="return").values():
+                if isinstance(answer, RemodelError):
+                    raise answer
+
+    def result(self, member: Future[tuple[int, str]]) -> tuple[int, str]:
+        """Return exit code and last words of a member that has ended."""
+        with self._asking():
+            try:
+                return member.result()
+            except self._killed as error:
+                return -signal.SIGKILL, f"killed the workers of {error.allowed_failures + 1} tries"
+
+    def close(self, under_way: Collection[Future[tuple[int, str]]]) -> None:
+        """End all members and processes, and leave the scheduler."""
+        with suppress(SchedulerError):
+            super().close(under_way)
+        self._client.close()
+
+    @contextmanager
+    def _asking(self, event: str = "is lost") -> Iterator[None]:
+        """Raise a SchedulerError if the scheduler does not answer."""
+        try:
+            yield
+        except (OSError, ValueError, CancelledError) as error:
+            raise SchedulerError(
+                f"--scheduler {self._scheduler}: {event}; all recorded results are saved; repeat "
+                "the command to resume, with or without a scheduler"
+            ) from error
+
+
 def cores() -> int:
     """Return the number of cores that this process may use."""
     return len(os.sched_getaffinity(0))
@@ -137,7 +333,9 @@ def environment_of_child() -> dict[str, str]:
     """Return a child's environment: this package, the loaded extensions, and one thread."""
     paths = [str(Path(__file__).parents[2]), *filter(None, [os.environ.get("PYTHONPATH")])]
     own = {"PYTHONPATH": os.pathsep.join(paths), "OMP_NUM_THREADS": "1"}
-    return os.environ | own | extensions_for_children()
+    # With variables of MPI and Slurm a child would be a rank.
+    kept = {name: value for name, value in os.environ.items() if not RANK_VARIABLES.match(name)}
+    return kept | own | extensions_for_children()
 
 
 def last_line(said: str) -> str:

@@ -64,6 +64,21 @@ def versions() -> dict[str, str]:
     } | extension_hashes()
 
 
+def software(extensions: str) -> dict[str, str]:
+    """Return hashes of sources and extensions and versions of libraries, without loading them."""
+    package, digest = Path(__file__).parents[1], hashlib.sha256()
+    for path in sorted(package.rglob("*")):
+        if path.suffix in (".py", ".c", ".h", ".toml"):
+            digest.update(path.read_bytes())
+    found = {"remodel_fenicsx": digest.hexdigest(), "Python": platform.python_version()}
+    for each in importlib.metadata.distributions():
+        found[each.name] = each.version
+    for file in filter(None, extensions.split(os.pathsep)):
+        content = Path(file).read_bytes() if Path(file).is_file() else b""
+        found[file] = hashlib.sha256(content).hexdigest()
+    return found
+
+
 def kernels() -> str:
     """Return the kernels at the points: "C", or "numpy" if REMODEL_FENICSX_KERNELS sets it."""
     name = os.environ.get(KERNELS, "C")

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import errno
+import fcntl
 import itertools
 import os
 import re
@@ -159,6 +160,26 @@ def _regular(path: Path, flags: int) -> tuple[int, os.stat_result]:
         number = errno.EISDIR if stat.S_ISDIR(status.st_mode) else errno.EINVAL
         raise ForeignFileError(number, FOREIGN.get(number, NO_FILE), str(path))
     return descriptor, status
+
+
+# ---------------------------------------------------------------- runs in folders
+SCENE, LOCK = "scene.toml", "run.lock"
+
+
+def lock_holder(folder: Path) -> tuple[str | None, bool]:
+    """Return text on the process that holds, or held, a folder's lock, and whether it lives."""
+    try:
+        descriptor = open_own(folder / LOCK, os.O_RDONLY)
+    except FileNotFoundError:
+        return None, False
+    with open(descriptor, "rb") as file:
+        try:
+            fcntl.flock(descriptor, fcntl.LOCK_SH | fcntl.LOCK_NB)
+            lives = False
+        except BlockingIOError:
+            lives = True
+        words = file.read(4096).decode(errors="replace").strip()
+    return words or None, lives  # none: just being written
 
 
 class ClosedAtEnd:

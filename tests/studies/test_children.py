@@ -12,47 +12,40 @@ from pathlib import Path
 
 import pytest
 
-from remodel_fenicsx.system.children import Worker, wait_for_one
+from remodel_fenicsx.system.children import WarmProcess
 from tests.parts import pulled_cube
 from tests.processes import CHILDREN, has_ended, members
 
 
 @pytest.fixture
-def worker() -> Iterator[Worker]:
+def process() -> Iterator[WarmProcess]:
     """A process; it ends with the test."""
-    made = Worker()
+    made = WarmProcess({})
     yield made
     made.stop()
     assert not made.is_alive
 
 
-def end_of(worker: Worker, words: list[str], messages: Path) -> int | None:
-    """Exit code of a command."""
-    worker.begin(words, messages)
-    assert worker.is_at_work
-    wait_for_one([worker], 300.0)
-    return worker.poll()
-
-
-def test_one_process_does_many_commands(worker: Worker, tmp_path: Path) -> None:
+def test_one_process_does_many_commands(process: WarmProcess, tmp_path: Path) -> None:
     """Each with words of its own; then it is killed in one of them."""
-    scene, number = tmp_path / "step-0.5.toml", worker.process.pid
+    scene, number = tmp_path / "step-0.5.toml", process.process.pid
     scene.write_text(pulled_cube(5000.0).to_toml())
     said = [tmp_path / f"{name}.txt" for name in ("one", "two", "three")]
-    assert end_of(worker, ["validate", str(tmp_path / "nothing.toml")], said[0]) == 2
-    assert worker.last_output().endswith("nothing.toml: no such file; a scene is a TOML file")
-    assert end_of(worker, ["no-such-command"], said[1]) == 2  # argparse ends in a way of its own
-    assert (
-        "no such file" not in said[1].read_text()
-        and worker.is_alive
-        and worker.process.pid == number
-    )
-    worker.begin(["run", str(scene), "-o", str(tmp_path / "run"), "-q"], said[2])
-    assert worker.poll() is None and worker.is_at_work
+
+    def end_of(words: list[str], messages: Path) -> tuple[int, str]:
+        process.begin(words, messages)
+        return process.result(messages)
+
+    code, words = end_of(["validate", str(tmp_path / "nothing.toml")], said[0])
+    assert code == 2 and words.endswith("nothing.toml: no such file; a scene is a TOML file")
+    assert end_of(["no-such-command"], said[1])[0] == 2  # argparse ends in a way of its own
+    assert "no such file" not in said[1].read_text()
+    assert process.is_alive and process.process.pid == number
+    process.begin(["run", str(scene), "-o", str(tmp_path / "run"), "-q"], said[2])
+    assert not process.has_ended(0.0)
     os.kill(number, signal.SIGKILL)
-    wait_for_one([worker], 300.0)
-    assert worker.poll() == -signal.SIGKILL and worker.last_output() == "killed by SIGKILL"
-    assert end_of(worker, ["info"], said[2]) == -signal.SIGKILL  # who is not there does nothing
+    assert process.result(said[2]) == (-signal.SIGKILL, "killed by SIGKILL")
+    assert end_of(["info"], said[2])[0] == -signal.SIGKILL  # who is not there does nothing
 
 
 # ---------------------------------------------------------------- the processes of a study
