@@ -193,6 +193,7 @@ class Members:
             self._at_work.remove(process)
             if process.is_alive:
                 self._idle.append(process)
+        self._end_without_command()
         return answer
 
     def send(self, number: int) -> None:
@@ -272,7 +273,8 @@ class Cluster(Threads):
             raise SchedulerError(
                 f"--scheduler: {error}; pip install remodel-fenicsx[cluster]"
             ) from error
-        logging.getLogger("distributed").setLevel(logging.CRITICAL + 1)
+        for name in ("distributed", "distributed.client"):
+            logging.getLogger(name).setLevel(logging.CRITICAL)
         self._killed = KilledWorker
         where = {"address" if "://" in scheduler else "scheduler_file": scheduler}
         with self._asking("is not reached"):
@@ -286,10 +288,12 @@ class Cluster(Threads):
 
     def places(self) -> int:
         """Return how many members may run at a time: the threads of all workers."""
-        with self._asking("has no workers"):
-            self._client.wait_for_workers(1, SECONDS_TO_END)
         with self._asking():
-            return min(sum(self._client.nthreads().values()), self._most)
+            threads = sum(self._client.nthreads().values())
+        if not threads:
+            with self._asking("has no workers"):
+                self._client.wait_for_workers(1, SECONDS_TO_END)
+        return min(threads, self._most)
 
     def everywhere(self, call: Callable[[], None]) -> None:
         """Call a method of the members on all workers."""
