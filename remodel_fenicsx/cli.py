@@ -569,10 +569,14 @@ def _schema(options: argparse.Namespace) -> None:
     _print(text)
 
 
-def _run_study(study: Callable[..., tuple[Path, StudyResult]], *wishes: object) -> int:
-    """Run a study; print its result, its folder and its failed runs."""
+def _run_study(
+    study: Callable[..., tuple[Path, StudyResult]], options: argparse.Namespace, **others: object
+) -> int:
+    """Run a study with all options that it takes; print its result, folder and failed runs."""
+    names = inspect.signature(study).parameters.keys() & vars(options)
+    others |= {name: vars(options)[name] for name in names}
     with _stopping("all recorded results are saved; repeat the command to resume"):
-        folder, result = study(*wishes)
+        folder, result = study(folder=options.output, **others)
     _print(f"{result.in_words()}\nresults in {folder}")
     _print_failures(result.failed)
     return SOLVE_FAILED if result.failed else 0
@@ -601,8 +605,7 @@ def _sweep(options: argparse.Namespace) -> int:
     points = (
         study.latin_hypercube(axes, options.latin, options.seed) if is_sampled else study.grid(axes)
     )
-    wishes = options.output, options.jobs, options.quiet, is_sampled, options.scheduler
-    return _run_study(study.sweep, options.scene, points, *wishes)
+    return _run_study(study.sweep, options, points=points, sampled=is_sampled)
 
 
 @command(
@@ -617,8 +620,7 @@ def _ensemble(options: argparse.Namespace) -> int:
     """Run a scene of random cells with many seeds."""
     from remodel_fenicsx.studies.sweep import ensemble
 
-    wishes = options.jobs, options.quiet, options.scheduler
-    return _run_study(ensemble, options.scene, options.output, options.seeds, *wishes)
+    return _run_study(ensemble, options)
 
 
 @command(
@@ -636,8 +638,7 @@ def _trade(options: argparse.Namespace) -> int:
     """Run a scene with coarse and fine settings, and show the cost and error of each."""
     from remodel_fenicsx.studies.trade import trade
 
-    wishes = options.jobs, options.quiet, options.scheduler
-    return _run_study(trade, options.scene, options.output, options.budget, *wishes)
+    return _run_study(trade, options)
 
 
 @command(
@@ -657,8 +658,7 @@ def _fit(options: argparse.Namespace) -> int:
     """Fit parameters of a scene to measurements, with 95 % confidence intervals."""
     from remodel_fenicsx.studies.fit import fit
 
-    wishes = options.starts, options.quiet, options.likelihood_profiles, options.jobs
-    return _run_study(fit, options.scene, options.data, options.output, *wishes)
+    return _run_study(fit, options, profiles=options.likelihood_profiles)
 
 
 @command(

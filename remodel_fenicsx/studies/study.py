@@ -401,13 +401,11 @@ class Study:
                     waiting.clear()
                     # Each run ends after its current step.
                     self._pool.everywhere(partial(self._pool.members.send, PAUSE))
-                while waiting and len(self._running) < self._pool.places():
-                    run = waiting.pop(0)
-                    member = self._pool.executor.submit(
-                        self._pool.members.run, run.folder, run.words()
-                    )
-                    self._running[member] = run
                 self._collect(pausing)
+                while len(self._running) < self._pool.places() and waiting:
+                    run, begin = waiting.pop(0), self._pool.members.run
+                    member = self._pool.executor.submit(begin, run.folder, run.words())
+                    self._running[member] = run
                 line.show(self._progress(len(waiting)))
         if pausing:
             raise Interrupted(PAUSE)

@@ -21,7 +21,7 @@ import sysconfig
 import threading
 import time as clock
 import types
-from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterator, Sequence
 from concurrent.futures import CancelledError, Executor, Future, ThreadPoolExecutor, wait
 from contextlib import contextmanager, suppress
 from pathlib import Path
@@ -133,36 +133,29 @@ class SchedulerError(RemodelError):
 class Members:
     """Members of a study that run in this process; pickled, those of the reading process."""
 
-    def __init__(
-        self,
-        study: str = "",
-        folder: Path = Path(),
-        holder: str | None = None,  # process with the lock of the folder; None: this one
-        variables: dict[str, str] = {},
-        expected: Mapping[str, str] = {},  # software
-    ):
-        self._about = study, folder, holder, variables, expected
+    def __init__(self, study: str, folder: Path, holder: str | None, expected: dict[str, str]):
+        self._about = study, folder, holder, expected
+        # process that holds the lock of the folder; None: this one
+        self._folder, self._holder, self._expected = folder, holder, expected
         self._idle: list[WarmProcess] = []
         self._at_work: list[WarmProcess] = []
         self._lock = threading.Lock()
-        self._signal, self._deadline = 0, math.inf
-        self._is_fit = holder is None
+        self._signal, self._deadline, self._is_fit = 0, math.inf, not holder
 
     def __reduce__(self) -> tuple[object, ...]:
         return _members_here, self._about
 
     def check(self) -> None:
         """Raise unless this worker has folder, lock and software of the command."""
-        _, folder, holder, variables, expected = self._about
-        (name, lives), words = lock_holder(folder), None
-        present = software(variables[EXTENSIONS])
-        differing = [item for item, value in expected.items() if present[item] != value]
-        if name != holder:
-            words = f"does not see {folder}; the folder must be on a file system of all machines"
+        (holder, lives), words = lock_holder(self._folder), ""
+        present = software(self._expected[EXTENSIONS])
+        differing = [name for name, one in self._expected.items() if one != present.get(name)]
+        if holder != self._holder:
+            words = f"does not see {self._folder}; put it on a file system of all machines"
         elif not lives:
-            words = f"{folder}: its file system keeps no lock between machines; mount it with flock"
+            words = f"does not see the lock of {self._folder}; mount its file system with flock"
         elif differing:
-            words = f"has another {differing[0]} than this command; start the worker again with it"
+            words = f"has another {differing[0]}; start it again with that of this command"
         if words:
             raise SchedulerError(f"worker on {socket.gethostname()}: {words}")
         self._is_fit = True
@@ -181,7 +174,11 @@ class Members:
         with self._lock:
             if self._signal:
                 return -self._signal, ""
-            process = self._idle.pop() if self._idle else WarmProcess(self._about[3])
+            process = (
+                self._idle.pop()
+                if self._idle
+                else WarmProcess({EXTENSIONS: self._expected[EXTENSIONS]})
+            )
             self._at_work.append(process)
             process.begin(words, messages)
         while not process.has_ended(POLL):
@@ -197,7 +194,7 @@ class Members:
         return answer
 
     def send(self, number: int) -> None:
-        """Send a signal to all members, now and later; kill them after a while unless they pause."""
+        """Send a signal to all members, now and later; kill them later unless they pause."""
         with self._lock:
             if number == self._signal:  # A second one would end them without a checkpoint.
                 return
@@ -216,8 +213,7 @@ class Members:
 
     def _end_without_command(self) -> None:
         """End the members if the command that has begun them was killed."""
-        _, folder, holder, *_ = self._about
-        if holder and lock_holder(folder) != (holder, True):
+        if self._holder and lock_holder(self._folder) != (self._holder, True):
             self.end()
 
 
@@ -234,7 +230,9 @@ class Threads:
     """Threads that wait for members of a study, which are processes of this machine."""
 
     def __init__(self, jobs: int | None):
-        self.jobs, self.members = jobs or cores(), Members()
+        self.jobs, self.members = jobs or cores(), Members(
+            "", Path(), None, extensions_for_children()
+        )
         self.executor: Executor = ThreadPoolExecutor(self.jobs)
 
     def places(self) -> int:
@@ -253,7 +251,7 @@ class Threads:
         """End all members and processes."""
         self.everywhere(self.members.end)
         wait(under_way, 2 * SECONDS_TO_END)
-        self.executor.shutdown()
+        self.executor.shutdown(wait=False)
 
 
 class Cluster(Threads):
@@ -279,9 +277,8 @@ class Cluster(Threads):
         where = {"address" if "://" in scheduler else "scheduler_file": scheduler}
         with self._asking("is not reached"):
             self._client = Client(**where, timeout=SECONDS_TO_CONNECT, set_as_default=False)
-        variables = extensions_for_children()
-        about = uuid4().hex, folder.absolute(), lock_holder(folder)[0], variables
-        self.members = Members(*about, software(variables[EXTENSIONS]))
+        expected = software(extensions_for_children()[EXTENSIONS])
+        self.members = Members(uuid4().hex, folder.absolute(), lock_holder(folder)[0], expected)
         self.executor = self._client.get_executor(pure=False)
         self.places()
         self.everywhere(self.members.check)
@@ -305,10 +302,10 @@ class Cluster(Threads):
     def result(self, member: Future[tuple[int, str]]) -> tuple[int, str]:
         """Return exit code and last words of a member that has ended."""
         with self._asking():
-            try:
-                return member.result()
-            except self._killed as error:
-                return -signal.SIGKILL, f"killed the workers of {error.allowed_failures + 1} tries"
+            error = member.exception()
+        if isinstance(error, self._killed):
+            return -signal.SIGKILL, f"killed its worker {error.allowed_failures + 1} times"
+        return member.result()
 
     def close(self, under_way: Collection[Future[tuple[int, str]]]) -> None:
         """End all members and processes, and leave the scheduler."""

@@ -66,17 +66,14 @@ def versions() -> dict[str, str]:
 
 def software(extensions: str) -> dict[str, str]:
     """Return hashes of sources and extensions and versions of libraries, without loading them."""
-    package, digest = Path(__file__).parents[1], hashlib.sha256()
-    for path in sorted(package.rglob("*")):
-        if path.suffix in (".py", ".c", ".h", ".toml"):
-            digest.update(path.read_bytes())
-    found = {"remodel_fenicsx": digest.hexdigest(), "Python": platform.python_version()}
-    for each in importlib.metadata.distributions():
-        found[each.name] = each.version
-    for file in filter(None, extensions.split(os.pathsep)):
-        content = Path(file).read_bytes() if Path(file).is_file() else b""
-        found[file] = hashlib.sha256(content).hexdigest()
-    return found
+    found = {each.name: each.version for each in importlib.metadata.distributions()}
+    sources = sorted(Path(__file__).parents[1].rglob("*.[pcht]*"))
+    files = {file: [Path(file)] for file in extensions.split(os.pathsep) if file}
+    files["remodel_fenicsx"] = [path for path in sources if path.suffix != ".pyc"]
+    for name, paths in files.items():
+        content = [path.read_bytes() for path in paths if path.is_file()]
+        found[name] = hashlib.sha256(b"".join(content)).hexdigest()
+    return found | {EXTENSIONS: extensions, "kernels": kernels()}
 
 
 def kernels() -> str:

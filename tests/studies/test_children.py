@@ -61,7 +61,9 @@ def test_a_stopped_study_ends_its_runs(number: int, tmp_path: Path) -> None:
     with subprocess.Popen(command, cwd=tmp_path, stderr=subprocess.PIPE, text=True) as process:
         assert process.stderr is not None
         assert process.stderr.readline().startswith("artery ensemble: 0 of 32 runs done")
-        (child,) = members(process.pid, CHILDREN)
+        while not (found := members(process.pid, CHILDREN)):
+            time.sleep(0.01)
+        (child,) = found
         process.send_signal(number)
         said = "" if number == signal.SIGKILL else process.stderr.read()
     expected = {signal.SIGTERM: 143, signal.SIGUSR1: 4, signal.SIGKILL: -signal.SIGKILL}
