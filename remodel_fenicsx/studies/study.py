@@ -47,7 +47,7 @@ from remodel_fenicsx.scene import Scene
 from remodel_fenicsx.scene.scene import SceneError
 from remodel_fenicsx.initial import resolve_auto_settings
 from remodel_fenicsx.system.environment import versions
-from remodel_fenicsx.system.children import Cluster, Threads
+from remodel_fenicsx.system.children import POLL, Cluster, Threads
 from remodel_fenicsx.system.files import (
     check_no_link,
     make_own_folder,
@@ -255,7 +255,6 @@ def read_notes(folder: Path, name: str) -> dict[str, list[str]]:
 # ---------------------------------------------------------------- a run of a study
 AnyResult = TypeVar("AnyResult", bound=StudyResult)
 
-POLL = 0.1  # seconds
 FEWEST_RUNS = 2  # smallest number of runs, or settings, that can be compared
 
 
@@ -352,7 +351,8 @@ class Study:
         scheduler: str | None = None,
     ):
         self.name, self.scene = name, scene
-        self.jobs, self.quiet, self.scheduler = jobs, quiet, scheduler
+        self.jobs, self.quiet = jobs, quiet
+        self.scheduler = scheduler
         self.folder = Path(folder or Path("results") / f"{scene.name}-{name}")
         place = self.folder.absolute()  # Processes on other machines have other working folders.
         self.runs = [Run(run, changed, place / run) for run, changed in scenes.items()]

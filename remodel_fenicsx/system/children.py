@@ -130,20 +130,24 @@ class SchedulerError(RemodelError):
     exit_code = BAD_ENVIRONMENT
 
 
+# study, folder, process that holds its lock (None: this one), software
+About = tuple[str, Path, str | None, dict[str, str]]
+
+
 class Members:
     """Members of a study that run in this process; pickled, those of the reading process."""
 
-    def __init__(self, study: str, folder: Path, holder: str | None, expected: dict[str, str]):
-        self._about = study, folder, holder, expected
-        # process that holds the lock of the folder; None: this one
-        self._folder, self._holder, self._expected = folder, holder, expected
+    def __init__(self, about: About):
+        self._about = about
+        _, self._folder, self._holder, self._expected = about
         self._idle: list[WarmProcess] = []
         self._at_work: list[WarmProcess] = []
         self._lock = threading.Lock()
-        self._signal, self._deadline, self._is_fit = 0, math.inf, not holder
+        self._signal, self._deadline = 0, math.inf
+        self._is_fit = not self._holder
 
     def __reduce__(self) -> tuple[object, ...]:
-        return _members_here, self._about
+        return _members_here, (self._about,)
 
     def check(self) -> None:
         """Raise unless this worker has folder, lock and software of the command."""
@@ -161,7 +165,7 @@ class Members:
         self._is_fit = True
 
     def run(self, folder: Path, words: Sequence[str]) -> tuple[int, str]:
-        """Begin a member with a command, or go on with it; return exit code and last words."""
+        """Begin a member with a command, or resume it; return exit code and last words."""
         if not self._is_fit:
             self.check()
         # Another command is running it, or a killed one that is still ending.
@@ -220,19 +224,18 @@ class Members:
 _PRESENT: dict[str, Members] = {}  # of a worker, by study
 
 
-def _members_here(*about: Any) -> Members:
+def _members_here(about: About) -> Members:
     for other in list(_PRESENT.values()):
         other._end_without_command()
-    return _PRESENT.setdefault(about[0], Members(*about))
+    return _PRESENT.setdefault(about[0], Members(about))
 
 
 class Threads:
     """Threads that wait for members of a study, which are processes of this machine."""
 
     def __init__(self, jobs: int | None):
-        self.jobs, self.members = jobs or cores(), Members(
-            "", Path(), None, extensions_for_children()
-        )
+        self.jobs = jobs or cores()
+        self.members = Members(("", Path(), None, extensions_for_children()))
         self.executor: Executor = ThreadPoolExecutor(self.jobs)
 
     def places(self) -> int:
@@ -278,7 +281,7 @@ class Cluster(Threads):
         with self._asking("is not reached"):
             self._client = Client(**where, timeout=SECONDS_TO_CONNECT, set_as_default=False)
         expected = software(extensions_for_children()[EXTENSIONS])
-        self.members = Members(uuid4().hex, folder.absolute(), lock_holder(folder)[0], expected)
+        self.members = Members((uuid4().hex, folder.absolute(), lock_holder(folder)[0], expected))
         self.executor = self._client.get_executor(pure=False)
         self.places()
         self.everywhere(self.members.check)

@@ -66,14 +66,15 @@ def versions() -> dict[str, str]:
 
 def software(extensions: str) -> dict[str, str]:
     """Return hashes of sources and extensions and versions of libraries, without loading them."""
-    found = {each.name: each.version for each in importlib.metadata.distributions()}
+    versions = {each.name: each.version for each in importlib.metadata.distributions()}
     sources = sorted(Path(__file__).parents[1].rglob("*.[pcht]*"))
     files = {file: [Path(file)] for file in extensions.split(os.pathsep) if file}
     files["remodel_fenicsx"] = [path for path in sources if path.suffix != ".pyc"]
+    hashes = {}
     for name, paths in files.items():
         content = [path.read_bytes() for path in paths if path.is_file()]
-        found[name] = hashlib.sha256(b"".join(content)).hexdigest()
-    return found | {EXTENSIONS: extensions, "kernels": kernels()}
+        hashes[name] = hashlib.sha256(b"".join(content)).hexdigest()
+    return versions | hashes | {EXTENSIONS: extensions, "kernels": kernels()}
 
 
 def kernels() -> str:
