@@ -39,7 +39,7 @@ running.run = run
 def sweep(folder: Path, *words: str, seconds: float = 30.0) -> subprocess.Popen[str]:
     """Start a sweep in a folder."""
     scene = folder / "cube.toml"
-    scene.write_text(SCENE.replace("mine", "cauchy").replace("2.0", "40.0"))
+    scene.write_text(SCENE.replace("mine", "cauchy").replace("2.0", "100.0"))
     command = [sys.executable, "-c", COMMAND, str(seconds), "sweep", str(scene), AXIS, *words]
     return subprocess.Popen(
         command, cwd=folder, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True
@@ -130,6 +130,11 @@ def numbers(folder: Path) -> dict[str, dict[str, list[float]]]:
     }
 
 
+def are_stopped(recorded: dict[str, dict[str, list[float]]]) -> bool:
+    """Whether a member has ended before its last step."""
+    return any(history["time"][-1] < 100 for history in recorded.values())
+
+
 @pytest.fixture(scope="module")
 def whole(tmp_path_factory: pytest.TempPathFactory) -> dict[str, dict[str, list[float]]]:
     """The sweep without a scheduler."""
@@ -165,6 +170,7 @@ def test_a_stopped_study_leaves_nothing_behind(
     study.send_signal(getattr(signal, number))
     assert ended(study)[0] == code and at_work and all(map(has_ended, at_work))
     assert not engine.at_work()
+    assert are_stopped(numbers(engine.folder / "out"))
     again = engine.study if number == "SIGKILL" else engine.alone
     assert ended(again("-o", "out", "-q")) == (0, [])
     assert numbers(engine.folder / "out") == whole
@@ -179,6 +185,7 @@ def test_a_signal_reaches_the_members_of_one_study(
     engine.wait_for_steps(second, "two")
     first.send_signal(signal.SIGUSR1)
     assert ended(first)[0] == 4 and second.poll() is None
+    assert are_stopped(numbers(engine.folder / "one"))
     assert ended(second) == (0, [])
     assert numbers(engine.folder / "two") == whole
 
