@@ -93,6 +93,9 @@ SLOW_STEP = 2 / 3
 # Number of factorisations in a solve. If it needs more, lagging is not the cause: the solve
 # continues as Newton's method for as many more.
 MOST_RENEWALS = 6
+# Iterations of a linear solve up to which the next one has the same preconditioner. New levels cost
+# about as much as 20 iterations.
+KEPT_LEVELS = 20
 
 # Relative tolerance of a linear solve that may be the last one: SURELY times the required
 # reduction, if above LAST.
@@ -340,60 +343,62 @@ class FullNewton:
 
 
 class Multigrid(FullNewton):
-    """GMRES with multigrid: new levels per tangent below degree 2, otherwise by PETSc's options."""
+    """GMRES with multigrid, and with a factorisation once multigrid has failed."""
 
     def __init__(self, equilibrium: Equilibrium, snes: SNES, matrix: Mat, options: ProblemOptions):
         super().__init__(equilibrium, snes, matrix, options)
-        self._solver, self._space = snes.getKSP(), equilibrium.state.unknown.function_space
+        self._solver = snes.getKSP()
         self._far = self._solver.getTolerances()[0]  # tolerance far from the solution
-        self._below: PMultigrid | None = None
+        self._levels: PMultigrid | None = None
+        self._factor: LaggedFactorisation | GatheredFactor | None = None
+        space, given = equilibrium.state.unknown.function_space, options.given
+        self._chooses = False
         if equilibrium.state.kinematics.reduced:
             return
-        given = {name.split("_")[0] for name in options.given}
-        self._chooses = "ksp" not in given and "snes_ksp_ew" not in options.given
-        if self._space.ufl_element().degree > 1 and not given & {"pc", "mg"}:
-            self._below = PMultigrid(
-                self._solver.getPC(), degree_one(self._space), matrix, elastic=True
-            )
-            if self._chooses:
-                # The tolerance is then that of the residual itself.
-                self._solver.setPCSide(PETSc.PC.Side.RIGHT)
+        self._chooses = not any(name.startswith(("ksp", "snes_ksp_ew")) for name in given)
+        if self._chooses:
+            # The tolerance is then that of the residual itself.
+            self._solver.setPCSide(PETSc.PC.Side.RIGHT)
+        if space.ufl_element().degree > 1 and not any(name[:2] in ("pc", "mg") for name in given):
+            self._levels = PMultigrid(self._solver.getPC(), degree_one(space), matrix)
         else:
-            matrix.setNearNullSpace(rigid_body_modes(self._space, matrix))
+            matrix.setNearNullSpace(rigid_body_modes(space, matrix))
 
     def tangent(self, norm: float, tolerance: float) -> None:
         super().tangent(norm, tolerance)
-        if self._below is not None and self._chooses:
+        if self._chooses:
             last = SURELY * tolerance / norm
             self._solver.setTolerances(rtol=last if last > LAST else self._far)
 
     def renew(self) -> None:
         super().renew()
-        if self._below is not None:
-            self._below.renew(self.matrix)
-        if self._below is not None or self._always:
-            self._set_up()
+        if self.tangents > 1 and self._solver.getIterationNumber() <= KEPT_LEVELS:
+            return
+        if self._factor is not None:
+            self._factor.renew(self.matrix)
+            return
+        if self._levels is not None:
+            self._levels.renew(self.matrix)
+        self._set_up()
+        self._solver.getPC().setReusePreconditioner(True)
 
     def fallback(self) -> tuple[str, AbstractContextManager[None]] | None:
-        if self._below is None:
-            return "with new multigrid levels in every iteration", self._anew()
-        if self.snes.getConvergedReason() != PETSc.SNES.ConvergedReason.DIVERGED_LINEAR_SOLVE:
+        failed = self.snes.getConvergedReason() == PETSc.SNES.ConvergedReason.DIVERGED_LINEAR_SOLVE
+        if self._factor is not None or not failed:
             return None
-        # Nearly incompressible tissue needs levels of the matrix itself, and an error norm measured
-        # by them.
         self.close()
-        self._solver.getPC().setFromOptions()
-        self.matrix.setNearNullSpace(rigid_body_modes(self._space, self.matrix))
-        if self._chooses:
-            self._solver.setPCSide(PETSc.PC.Side.LEFT)
-            self._solver.setNormType(PETSc.KSP.NormType.PRECONDITIONED)
-            self._solver.setTolerances(rtol=self._far)
-        return "with multigrid levels of the matrix from now on", nullcontext()
+        self._factor = kept_factor(self.equilibrium.comm)
+        preconditioner = self._solver.getPC()
+        preconditioner.setType(PETSc.PC.Type.PYTHON)
+        preconditioner.setPythonContext(self._factor)
+        return "with a factorisation from now on", nullcontext()
 
     def close(self) -> None:
-        if self._below is not None:
-            self._below.destroy()
-        self._below = None
+        if self._levels is not None:
+            self._levels.destroy()
+        if self._factor is not None:
+            self._factor.close()
+        self._levels = self._factor = None
 
 
 class Lagged(FullNewton):

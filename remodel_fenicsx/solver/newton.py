@@ -124,6 +124,9 @@ class Convergence:
 NEAR_LIMIT, RESERVE = 0.95, 0.3
 NOWHERE = StateLimits(0.0, 1.0, (np.nan,) * 3)
 LINE_SEARCH_HALVINGS = 20  # number of halvings of a Newton step before the line search fails
+# A solve fails after so many Newton steps in a row with at least so many halvings. Solves that
+# succeed have at most three such steps; on a thin wall under too much load all are so short.
+SHORT_STEPS, SHORT_STEP_HALVINGS = 4, 6
 # Smallest displacement of a jump, relative to the body's size; for a tube ten radii long this is
 # 1 % of its radius.
 POSSIBLE_JUMP = 1e-3
@@ -185,6 +188,7 @@ class _Solve:
     # All states whose |dF| from the last evaluated state is below this are admissible.
     safe_change: float = 0.0
     is_certain: bool = False  # whether the state is one of them
+    short_steps: int = 0  # number of Newton steps in a row that the guards have made very short
 
 
 # By PETSc's SNESConvergedReason, as numbers, because the names differ between its versions.
@@ -192,6 +196,7 @@ SNES_REASONS = {
     -3: "the linear solver failed",
     -4: "overflow or NaN in the residual; check units and magnitudes of loads and parameters",
     -6: "the line search did not reduce the residual",
+    -8: "the guards r < L and J > 0 make all Newton steps too short",
     -9: "the residual diverged",
 }
 DIVERGED_MAX_IT = -5
@@ -289,7 +294,7 @@ class GuardedNewton:
         )
         if isinstance(first, Solution):
             return first
-        second = self._linear.fallback()
+        second = None if self._present.short_steps >= SHORT_STEPS else self._linear.fallback()
         if second is None:
             raise first
         words, other_way = second
@@ -466,6 +471,7 @@ class GuardedNewton:
                 "line search failed: no step with r < L and J > 0 after %d halvings",
                 LINE_SEARCH_HALVINGS,
             )
+        present.short_steps = present.short_steps + 1 if halving >= SHORT_STEP_HALVINGS else 0
         if halving:
             log.debug("Newton step shortened to 1/%d to keep r < L and J > 0", 2**halving)
         return improved or halving > 0
@@ -492,6 +498,8 @@ class GuardedNewton:
         present.previous, present.norm = present.norm if iteration else np.inf, norm
         if self.convergence.reached(norm, present.previous):
             return PETSc.SNES.ConvergedReason.CONVERGED_FNORM_ABS
+        if present.short_steps >= SHORT_STEPS:
+            return PETSc.SNES.ConvergedReason.DIVERGED_LOCAL_MIN
         if iteration >= snes.getTolerances()[3] or self._linear.given_up:
             return PETSc.SNES.ConvergedReason.DIVERGED_MAX_IT
         return PETSc.SNES.ConvergedReason.ITERATING
