@@ -203,8 +203,8 @@ class Elastin(Table):
         default=(1.0, 1.0), json_schema_extra={"allowed": "two numbers greater than 0"}
     )
     """Circumferential and axial stretch of elastin beyond that of collagen deposited at the start;
-    its radial stretch keeps the volume. Fresh tissue stays stress-free. In the body's local
-    axes."""
+    its radial stretch keeps the volume. Fresh tissue stays stress-free. In the body's local axes:
+    of a sheet x and y, of a cube or tendon y and the axis of the load, z."""
 
 
 @with_old_names
