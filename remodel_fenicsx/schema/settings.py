@@ -539,7 +539,7 @@ class Cells(Table):
 
         The result has shape (number_of_elements, 3). Every rank draws the complete list of random
         cells in the mesh file's order. An element therefore has the same draw on any number of
-        ranks.
+        ranks. Cells that a file has are NaN.
         """
         r0 = self.end_to_end_length
         if self.initial == "random":
@@ -554,6 +554,8 @@ class Cells(Table):
             lengths = [r0 / np.sqrt(3)] * 3
         elif self.initial == "aligned":
             lengths = [r0 if axis == self.aligned_axis else 0.0 for axis in (1, 2, 3)]
+        elif self.initial == MEASURED_CELLS:
+            lengths = [np.nan] * 3
         return np.tile(np.array(lengths), (number_of_elements, 1))
 
 

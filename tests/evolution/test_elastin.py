@@ -179,10 +179,7 @@ def balanced(layers: Any, row: dict[str, float], axial: float = 1.1) -> None:
 def test_a_prestretch_of_one_changes_no_digit() -> None:
     """Also not of a wall that remodels."""
     names = [*RADII, *ANGLES, "content", *HOOP]
-    key, material = "material.elastin.prestretch", {"lame_mu": 7.0, "lame_lambda": 61.6}
-    plain, without = (
-        vessel(names, **EARLY | change) for change in ({key: (1.0, 1.0)}, {"material": material})
-    )
+    plain, without = (vessel(names, **EARLY | change) for change in COMMON["plain"])
     assert plain.is_stress_free and not plain.material.has_elastin
     for one, other in zip(*map(rows_of, (plain, without)), strict=True):
         assert one | {"seconds": 0.0} == other | {"seconds": 0.0}
@@ -229,12 +226,11 @@ def own(file: Path, **tables: Any) -> Scene:
 def test_an_own_mesh_of_the_tube_is_the_tube(tmp_path: Path) -> None:
     """With directions that are found in it; nothing moves without loads."""
     file = write_tube(tmp_path / "tube.msh", counts=(24, 4, 1), degree=2)
-    loads: Any = {"loads": ramped(2.0, pressure=1.5, elongation=0.1)}
-    degree: Any = {"mesh": {"degree": 2}}
-    alone = last_row(own(file, loads={}, time={"end": 1.0}, **degree))
+    pressed = COMMON["pressed"]
+    alone = last_row(own(file, **pressed | {"loads": {}}))
     assert alone["lumen_volume"] == pytest.approx(3 * np.pi, rel=1e-4)
-    radial = last_row(passive([*RADII, *ALONG], **COMMON["same"] | SHORT | loads))
-    row = last_row(own(file, **loads, **degree))
+    radial = last_row(passive([*RADII, *ALONG], **COMMON["same"] | pressed))
+    row = last_row(own(file, **pressed))
     assert row["lumen_volume"] == pytest.approx(3.3 * np.pi * radial["inner_radius"] ** 2, rel=1e-3)
     assert [row[name] for name in ALONG] == pytest.approx(
         [radial[name] for name in ALONG], rel=1e-3
@@ -293,8 +289,7 @@ def test_a_wall_on_its_way_is_that_of_the_reference() -> None:
     reference = ElasticWall(RadialMaterial(lame_mu=7.0, lame_lambda=61.6), **COMMON["reference"])
     reference.run(1.3, 0.32, 8.0, 20.0, 0.5)
     expected = reference.row()
-    fine = {"time.end": 20.0, "time.step": 0.5, "mesh.refinement": 6}
-    scene = vessel(expected, **EARLY | fine)
+    scene = vessel(expected, **EARLY | COMMON["fine"])
     with simulated(scene) as (simulation, of_run):
         assert opening_angle(simulation) == pytest.approx(reference.cut(), abs=0.5)
     for name, value in expected.items():
@@ -344,8 +339,7 @@ def test_a_driver_may_take_the_stress_of_collagen_alone() -> None:
     """By hand; it has no elastin in it, and the columns of both parts are the whole stress."""
     mine = Driver(lambda F, stresses: stresses.collagen.cauchy, False)  # type: ignore[union-attr]
     with patch.dict(DRIVERS, mine=mine):
-        mine_alone = {"remodeling.driver": "mine", "remodeling.exponent": 2.0}
-        scene = vessel(HOOP, **EARLY | mine_alone)
+        scene = vessel(HOOP, **EARLY | COMMON["mine"])
         with simulated(scene) as (simulation, _):
             remodeling = simulation.stepper.remodeling
             collagen, expected = remodeling.driving_tensor()[1], network_by_hand(simulation)
