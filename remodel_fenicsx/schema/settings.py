@@ -203,8 +203,8 @@ class Elastin(Table):
         default=(1.0, 1.0), json_schema_extra={"allowed": "two numbers greater than 0"}
     )
     """Circumferential and axial stretch of elastin beyond that of collagen deposited at the start;
-    its radial stretch keeps the volume. Fresh tissue stays stress-free. In the body's local
-    axes."""
+    its radial stretch keeps the volume. Fresh tissue stays stress-free. In the body's local axes:
+    of a sheet x and y, of a cube or tendon y and the axis of the load, z."""
 
 
 @with_old_names
@@ -539,7 +539,7 @@ class Cells(Table):
 
         The result has shape (number_of_elements, 3). Every rank draws the complete list of random
         cells in the mesh file's order. An element therefore has the same draw on any number of
-        ranks.
+        ranks. Cells that a file has are NaN.
         """
         r0 = self.end_to_end_length
         if self.initial == "random":
@@ -554,6 +554,8 @@ class Cells(Table):
             lengths = [r0 / np.sqrt(3)] * 3
         elif self.initial == "aligned":
             lengths = [r0 if axis == self.aligned_axis else 0.0 for axis in (1, 2, 3)]
+        elif self.initial == MEASURED_CELLS:
+            lengths = [np.nan] * 3
         return np.tile(np.array(lengths), (number_of_elements, 1))
 
 
