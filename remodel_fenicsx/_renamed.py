@@ -26,17 +26,19 @@ OLD_NAMES: Mapping[str, Mapping[str, str]] = {
         "keep_nothing": "disable_reuse",
         "more_iterations": "iteration_factor",
     },
-    "Kinematics": {"on": "for_mesh", "moves_rigidly": "has_rigid_modes"},
+    "Kinematics": {"on": "for_mesh", "moves_rigidly": "has_rigid_modes", "closing": "closed_ring"},
     "Law": {
         "share": "relax",
         "of_absolute_time": "depends_on_absolute_time",
         "asks_kappa": "stops_at_zero_kappa",
+        "takes_set_points": "uses_exponent_and_threshold",
     },
     "LoadKind": {"instead_of": "replaces", "frees_length": "makes_length_unknown"},
     "Loading": {"measure_alone": "separate_measure"},
     "Material": {"tells_volume_apart": "has_volumetric_split"},
     "Matrix": {"of": "with_parameters"},
     "Measurement": {"tool": "cached", "tool_of_step": "cached_for_step"},
+    "NaturalConfiguration": {"closing": "closed_ring"},
     "Parameter": {"above": "exclusive_minimum"},
     "Quadrature": {
         "beyond": "polynomial_residual",
@@ -44,6 +46,7 @@ OLD_NAMES: Mapping[str, Mapping[str, str]] = {
         "element_mean_of_known": "element_nanmean",
         "place_of_largest": "argmax_position",
     },
+    "Remodeling": {"has_set_point": "changes_exponent_or_threshold"},
     "Scene": {
         "turned_away": "loaded_shape_warnings",
         "needs_all_points": "displacement_reason",

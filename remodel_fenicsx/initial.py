@@ -157,7 +157,7 @@ def natural_gradient(
         except ArithmeticError as error:
             angle = f"natural.opening_angle = {natural.opening_angle:g}"
             raise SceneError(
-                f"{angle}: must be smaller, or natural.layers nearer to 1: {error}"
+                f"{angle}: must be smaller, or the stretches of natural.layers nearer to 1: {error}"
             ) from error
         radii = np.linalg.norm(local_axes.coordinates[..., :2], axis=-1)
         inner, outer, *_ = ring.panels.edges

@@ -179,7 +179,7 @@ def close_ring(layers: Sequence[Layer], opening_angle: float, loads: Loads = Loa
         ]
         if len(pieces) > MOST_POLYNOMIALS * len(layers):
             raise ArithmeticError(
-                f"ring and sector vary too much through the wall for {len(pieces)} polynomials"
+                f"the stretches vary too steeply through the wall for {len(pieces)} polynomials"
             )
         finer = Panels([pieces[0].radii[0], *(piece.radii[1] for piece in pieces)], DEGREE)
         radius = ring.natural_radius(finer.places)
