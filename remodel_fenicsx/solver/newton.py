@@ -24,7 +24,7 @@ from remodel_fenicsx.fem.solver_methods import (
 from remodel_fenicsx.schema.settings import Solver
 from remodel_fenicsx.solver.attempts import MADE_ANEW, attempted, say
 from remodel_fenicsx.solver.equilibrium import Equilibrium, StateLimits, PointState
-from remodel_fenicsx.solver.linear import FullNewton
+from remodel_fenicsx.solver.linear import FullNewton, cheaper_method
 from remodel_fenicsx.state import stress_rounding
 from remodel_fenicsx.system.interrupts import Interrupted
 
@@ -238,6 +238,8 @@ class GuardedNewton:
         self.method = method = resolve_auto(
             settings.method, unknowns, is_reduced, kinematics.suits_multigrid
         )
+        if method != settings.method and method == "iterative":
+            self.method = method = cheaper_method(self._matrix)
         # In three dimensions a named method is not replaced, so that results do not depend on the
         # size.
         small = is_small(unknowns, is_reduced) and (is_reduced or settings.method == AUTO)
