@@ -25,6 +25,7 @@ OLD_NAMES: Mapping[str, Mapping[str, str]] = {
         "second_try": "fallback",
         "keep_nothing": "disable_reuse",
         "more_iterations": "iteration_factor",
+        "keeps": "reuses_factorisation",
     },
     "Kinematics": {"on": "for_mesh", "moves_rigidly": "has_rigid_modes", "closing": "closed_ring"},
     "Law": {

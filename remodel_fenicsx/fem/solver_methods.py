@@ -168,8 +168,8 @@ def method_options(method: str, ranks: int, small: bool = False) -> dict[str, ob
 
 def levels_options(ranks: int) -> dict[str, object]:
     """Return the PETSc options of two levels, of which the lower one is factorised."""
-    # With GAMG in place of the factor a thin wall takes 1.5 times as many iterations, and with block
-    # Jacobi in place of SOR five times as many.
+    # On a thin wall GAMG instead of the factor takes 1.5 times as many iterations, and block
+    # Jacobi instead of SOR four times as many.
     factor = factor_options(SYMMETRIC)
     if ranks > 1:
         factor = {f"telescope_{name}": value for name, value in factor.items()}

@@ -1221,7 +1221,7 @@ class Solver(Table):
         default=AUTO,
         description=f"Solver of each step's equations. 'auto' takes 'direct' up to {MAX_DIRECT_3D} "
         f"unknowns ({MAX_DIRECT_REDUCED} of a reduction), then 'lagged', and above "
-        f"{MIN_MULTIGRID} 'iterative'. {meanings(SOLVER_METHODS)} "
+        f"{MIN_MULTIGRID} 'iterative' where a factorisation costs more. {meanings(SOLVER_METHODS)} "
         "(docs/speed_and_accuracy.md).",
     )
     predictor: Literal["none", "autoregressive", "with-tolerance"] = "autoregressive"

@@ -272,7 +272,7 @@ class FullNewton:
     """
 
     given_up = False  # whether the solve shall stop
-    keeps = False  # whether a factorisation is reused in later solves
+    reuses_factorisation = False  # whether a factorisation is reused in later solves
 
     def __init__(self, equilibrium: Equilibrium, snes: SNES, matrix: Mat, options: ProblemOptions):
         self.equilibrium, self.snes = equilibrium, snes
@@ -439,7 +439,7 @@ def cheaper_method(matrix: Mat) -> str:
 class Lagged(FullNewton):
     """Modified Newton with L-BFGS: the tangent is renewed if more iterations would cost more."""
 
-    keeps = True
+    reuses_factorisation = True
     # Whether each solve factorises first, and one slow iteration suffices to do so again.
     _begins_anew = False
 
