@@ -72,6 +72,7 @@ from remodel_fenicsx.body.shape import (
     COLUMNS_ON_REQUEST as COLUMNS_ON_REQUEST,
     Column as Column,
     End as End,
+    WithAxes as WithAxes,
     WithRegions as WithRegions,
     cauchy_columns as cauchy_columns,
     uniaxial_columns as uniaxial_columns,

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Mapping
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -156,7 +157,7 @@ def natural_gradient(
         except ArithmeticError as error:
             angle = f"natural.opening_angle = {natural.opening_angle:g}"
             raise SceneError(
-                f"{angle}: must be smaller, or natural.layers nearer to 1: {error}"
+                f"{angle}: must be smaller, or the stretches of natural.layers nearer to 1: {error}"
             ) from error
         radii = np.linalg.norm(local_axes.coordinates[..., :2], axis=-1)
         inner, outer, *_ = ring.panels.edges
@@ -175,7 +176,8 @@ def natural_gradient(
         fresh = np.ones_like(stretches)
         for name, properties in scene.properties().items():
             chosen = domain.element_region == domain.regions[name] if name else slice(None)
-            fresh[chosen] = fresh_stretches(properties.tissue)
+            tissue = replace(properties.tissue, elastin_axes=shape.directions)
+            fresh[chosen] = fresh_stretches(tissue)
         stretches *= fresh
     return stretch_tensor(stretches, local_axes.axes).reshape(*quadrature.shape, 3, 3), ring
 

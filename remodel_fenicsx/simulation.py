@@ -185,21 +185,19 @@ def build(
         weights = [case.weight for case in scene.cases]
         load_cases.join(stepper, further_states, further_loads, weights, solver, kappa)
     time_stepping = _time_stepping(scene, stepper)
-    estimated = (
-        [TIME_ERROR] if scene.time.is_adaptive and TIME_ERROR not in scene.output.columns else []
-    )
+    additional_columns = {TIME_ERROR} - {*scene.output.columns} if scene.time.is_adaptive else set()
     return SimulationParts(
         scene,
         domain,
         stepper,
-        Observer(scene.geometry, stepper, scene.columns(estimated)),
+        Observer(scene.geometry, stepper, scene.columns(additional_columns)),
         time_stepping,
     )
 
 
 def _solver(scene: Scene) -> Solver:
-    """Return the solver settings, without a predictor if it costs more time than it saves."""
-    # A predictor helps only if a tolerance or the steady state requires accurate rows.
+    """Return the solver settings, without the predictor 'with-tolerance' if steps are constant."""
+    # 'with-tolerance' predicts only in adaptive steps and on the path to the steady state.
     solver, time = scene.solver, scene.time
     if solver.predictor == "with-tolerance" and time.tolerance is None and not time.is_equilibrium:
         return solver.model_copy(update={"predictor": "none"})
@@ -233,8 +231,8 @@ def _time_stepping(scene: Scene, stepper: Stepper) -> TimeStepping:
         return FixedSteps(stepper, time.end, time.step, TimeError(stepper).measure)
     from remodel_fenicsx.evolution import homeostasis
 
-    falls = any(load.decreases for load in scene.loads.values())
-    tolerance = time.tolerance or (homeostasis.UNLOADING if falls else homeostasis.PATH_TOLERANCE)
+    unloads = any(load.decreases for load in scene.loads.values())
+    tolerance = time.tolerance or (homeostasis.UNLOADING if unloads else homeostasis.PATH_TOLERANCE)
     if scene.has_random_cells and scene.has_order_jumps:
         tolerance = homeostasis.NO_ERROR_CONTROL
     held_from, hold = max(stops[:-1], default=0.0), scene.hold_before_change
@@ -281,17 +279,14 @@ def reset_simulation(simulation: Simulation, start: Snapshot, scene: Scene) -> b
     ):
         return False
     for name, value in tissue.parameters.items():
-        numbers = (
-            parameters[name].x.array
-            if isinstance(parameters[name], Function)
-            else parameters[name].value
-        )
+        present = parameters[name]
+        numbers = present.x.array if isinstance(present, Function) else present.value
         numbers[...] = value.x.array if varies[name] else value
     stepper.replace_loads_and_kappa(partial(values_of_loads, scene.loads), kappa)
     simulation.state.restore(start)
     if isinstance(kinematics, NaturalConfiguration) and not scene.natural.fibres:
         cells, quadrature = simulation.cells, simulation.quadrature
-        values, kinematics.closing = natural_gradient(
+        values, kinematics.closed_ring = natural_gradient(
             scene, quadrature, simulation.domain, cells.local_axes
         )
         quadrature.values(kinematics.gradient, (3, 3))[:] = values

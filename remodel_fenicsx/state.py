@@ -24,7 +24,14 @@ from remodel_fenicsx.fem.quadrature import Quadrature
 from remodel_fenicsx.kernels import PointKernels, point_kernels, with_kernels
 from remodel_fenicsx.model.axes import AXES, LocalAxes, cells_from_tensors, structure_tensors
 from remodel_fenicsx.model.cells import UnitCell
-from remodel_fenicsx.model.energy import ELASTIN, MATRICES, TURNED_OVER, Tissue, mixture_matrix
+from remodel_fenicsx.model.energy import (
+    AXES_ON_THE_RADIUS,
+    ELASTIN,
+    MATRICES,
+    TURNED_OVER,
+    Tissue,
+    mixture_matrix,
+)
 from remodel_fenicsx.schema.settings import Cells, MEASURED_CELLS, Properties
 
 if TYPE_CHECKING:
@@ -191,7 +198,7 @@ class UnitCells(CellField):
 class Snapshot:
     """Values of a state: arrays by function name, loads, time, number of steps, other numbers."""
 
-    arrays: dict[str, NDArray[np.float64]]
+    arrays: dict[str, Array]
     loads: dict[str, float]
     time: float
     number: int
@@ -280,7 +287,7 @@ class State:
         self.mark_cells_in_equilibrium()
         solved = self.equilibrium_cells
         self._functions: dict[str, dolfinx.fem.Function] = {}
-        self._arrays: dict[str, NDArray[np.float64]] = {}  # the functions' own memory
+        self._arrays: dict[str, Array] = {}  # the functions' own memory
         for function in (
             self.unknown,
             cells.dimensions,
@@ -311,7 +318,7 @@ class State:
     def _dof_of_node(self) -> NDArray[np.int64]:
         return dof_of_node(self.loading.domain.mesh, self.kinematics.nodal_space(self.unknown))
 
-    def gathered_displacement(self) -> NDArray[np.float64] | None:
+    def gathered_displacement(self) -> Array | None:
         """Return the displacement of mesh nodes in the mesh file's order on rank 0. Collective.
 
         Returns
@@ -323,7 +330,7 @@ class State:
             self.kinematics.nodal_displacement(self.unknown)[self._dof_of_node]
         )
 
-    def deformation_gradient(self) -> NDArray[np.float64]:
+    def deformation_gradient(self) -> Array:
         """Return F of the present unknowns, flattened over the quadrature points of this rank.
 
         Returns
@@ -338,13 +345,13 @@ class State:
         )
 
     @property
-    def natural_gradient(self) -> NDArray[np.float64] | None:
+    def natural_gradient(self) -> Array | None:
         """G at all points, (elements, points, 3, 3); None if the mesh is stress-free."""
         return (
             None if self._natural is None else self.cells.quadrature.values(self._natural, (3, 3))
         )
 
-    def elastic(self, deformation_gradient: NDArray[np.float64]) -> NDArray[np.float64]:
+    def elastic(self, deformation_gradient: Array) -> Array:
         """Return F_e = F G, or F if the mesh is stress-free.
 
         Parameters
@@ -355,9 +362,7 @@ class State:
         G = self.natural_gradient
         return deformation_gradient if G is None else deformation_gradient @ G
 
-    def elastic_axes(
-        self, axes: NDArray[np.float64], deformation_gradient: NDArray[np.float64] | None = None
-    ) -> NDArray[np.float64]:
+    def elastic_axes(self, axes: Array, deformation_gradient: Array | None = None) -> Array:
         """Return axes convected by F_e, or without an F by G to the unloaded configuration.
 
         Parameters
@@ -374,7 +379,7 @@ class State:
         )
         return axes if gradient is None else axes @ np.swapaxes(gradient, -1, -2)
 
-    def elastic_gradient(self) -> NDArray[np.float64]:
+    def elastic_gradient(self) -> Array:
         """Return F_e of the present unknowns, flattened, (elements * points, 3, 3); read-only."""
         if self._natural is None:
             return self.deformation_gradient()
@@ -398,7 +403,7 @@ class State:
         self.cells.prepared.append(prepared)
         return prepared
 
-    def per_mesh_volume(self, values: NDArray[np.float64]) -> NDArray[np.float64]:
+    def per_mesh_volume(self, values: Array) -> Array:
         """Convert values per initial stress-free volume to values per mesh volume.
 
         Parameters
@@ -618,9 +623,9 @@ class FieldHistory:
 
 def tissue_at_points(tissue: Tissue, quadrature: Quadrature) -> Tissue:
     """Return a tissue with parameters as arrays over the points, (elements * points,)."""
-    axes = tissue.elastin_axes
-    if axes is not None:
-        tissue = replace(tissue, elastin_axes=quadrature.values(axes, (3, 3)).reshape(-1, 3, 3))
+    if tissue.elastin_axial is not None:
+        axes = quadrature.values(tissue.elastin_axes, (3, 3)).reshape(-1, 3, 3)
+        tissue = replace(tissue, elastin_axes=axes)
     return tissue.map(lambda name, value: assembly.point_values(value, quadrature).reshape(-1))
 
 
@@ -678,7 +683,7 @@ class Parameters:
         """Return the tissue with the largest value of each parameter in the body. Collective."""
 
         def largest_values() -> Tissue:
-            maxima = replace(self.compiled, elastin_axes=None).map(
+            maxima = replace(self.compiled, elastin_axes=AXES_ON_THE_RADIUS).map(
                 lambda name, value: self.quadrature.maximum(
                     assembly.point_values(value, self.quadrature)
                 )

@@ -349,7 +349,7 @@ def _rarely(random: Random, scene: Values, stiffness: float) -> None:
             scene["natural"]["layers"] = [
                 {"from": rounded(random.uniform(0.2, 0.8)), "prestretch": along}
             ]
-    _set_points(random, scene, stiffness)
+    _exponent_and_threshold(random, scene, stiffness)
     plain = (
         "tolerance" not in scene["time"]
         and "profile" not in scene
@@ -407,7 +407,7 @@ def _cases(random: Random, scene: Values) -> None:
     scene["remodeling"]["mean"] = random.choice(means)
 
 
-def _set_points(random: Random, scene: Values, stiffness: float) -> None:
+def _exponent_and_threshold(random: Random, scene: Values, stiffness: float) -> None:
     """Exponent and threshold of the law that has them."""
     remodeling = scene["remodeling"]
     if remodeling["law"] != "tensor":

@@ -13,7 +13,7 @@ from remodel_fenicsx.body import gmsh_model as model
 from remodel_fenicsx.body.shape import (
     Column,
     LoadKind,
-    Shape,
+    WithAxes,
     axial_dead_force,
     cauchy_columns,
     check_lengths,
@@ -33,7 +33,7 @@ if TYPE_CHECKING:
     from remodel_fenicsx.body.loading import Loading
 
 
-class Box(Shape):
+class Box(WithAxes):
     """Block from the origin along x, y and z, with symmetry planes x = y = z = 0."""
 
     face_names = ("x0", "x1", "y0", "y1", "z0", "z1")
@@ -243,6 +243,7 @@ class Sheet(Box):
     _counts: ClassVar[tuple[int, int, int]] = (4, 4, 1)
     depth_labels = ("through the sheet", "lower face", "upper face")
     angle_in_words = ("along x", "across x")
+    directions = np.eye(3)
     buckles = False  # the face z = 0 stays in its plane
 
     shape: Literal["sheet"] = "sheet"

@@ -158,7 +158,7 @@ class FileBody(WithRegions, FromFile):
     """Body with the mesh, faces and regions of a file."""
 
     supported_faces = None
-    thickness_in_words: ClassVar[str] = "cube root of the volume"
+    thickness_in_words: ClassVar[str] = "cube root of the volume (elements with plane faces)"
 
     file: Annotated[str | tuple[str, ...], BeforeValidator(_file)] = Field(
         json_schema_extra={
@@ -436,7 +436,8 @@ class FileBody(WithRegions, FromFile):
                     raise SceneError(f"{key}: {rule}; a face that is displaced must be {able}")
                 if domain.boundary.goes_around(face):  # type: ignore[attr-defined]
                     raise SceneError(
-                        f"{key}: this face goes around the body, so that there is no direction"
+                        f"{key}: this face goes around the body, so that it has no mean normal, "
+                        "the direction of the displacement; choose a part of it, or another face"
                     )
                 if face in moved:
                     raise SceneError(
@@ -459,7 +460,7 @@ class FileBody(WithRegions, FromFile):
         length = domain.length()
         unit = f" {self.length_unit}" if self.length_unit else ""
         if domain.comm.rank == 0:
-            words = f"{self.thickness_in_words} {domain.thickness:.6g}{unit}, with plane faces"
+            words = f"{self.thickness_in_words} {domain.thickness:.6g}{unit}"
             log.info(
                 "%s%s", words, f"; length from inlet to outlet {length:.6g}{unit}" if length else ""
             )
@@ -579,7 +580,7 @@ class MeshBody(WalledMesh, Unloads, FileBody):
         *WalledMesh.columns_on_request,
     )
     face_names = mesh_faces.ROLES
-    thickness_in_words = "mean thickness of the wall"
+    thickness_in_words = "mean thickness of the wall (volume over area, elements with plane faces)"
 
     shape: Literal["mesh"] = "mesh"
     """Shape of the body."""

@@ -564,6 +564,8 @@ class Shape(_Is):  # type: ignore[misc]
     supported_faces
         Faces for which `[supports.NAME]` may define springs, as for surrounding tissue. With None
         every face may have any support.
+    directions
+        Local axes as rows, (3, 3), unless `axes_at` depends on the position: y, z and x.
 
     Raises
     ------
@@ -610,6 +612,7 @@ class Shape(_Is):  # type: ignore[misc]
     constant_fields: ClassVar[tuple[str, ...]] = ()
     defaults: ClassVar[dict[str, Any]] = {}
     supported_faces: ClassVar[tuple[str, ...] | None] = ()
+    directions: ClassVar[Array] = np.roll(np.eye(3), -1, axis=0)
 
     shape: str
     """Shape of the body."""
@@ -646,14 +649,14 @@ class Shape(_Is):  # type: ignore[misc]
     def axes_at(self, coordinates: Array) -> Array:
         """Return local axes at positions (..., 3) as rows circumferential, axial, radial.
 
-        By default these are y, z and x; z is the direction of the load.
+        By default these are `directions`: y, z and x, where z is the direction of the load.
 
         Parameters
         ----------
         coordinates
             Reference positions, (..., 3), in the unit of length.
         """
-        return np.broadcast_to(np.roll(np.eye(3), -1, axis=0), (*coordinates.shape[:-1], 3, 3))
+        return np.broadcast_to(self.directions, (*coordinates.shape[:-1], 3, 3))
 
     def depth(self, coordinates: Array) -> Array:
         """Return the normalised depth of positions (..., 3), from 0 to 1; by default along z.
@@ -906,6 +909,19 @@ class WithRegions(Shape):
             if region.outer_radius is not None:
                 rule = f"the mesh defines the regions of a {self.name}; only a tube has this key"
                 raise validation_error(rule, f"regions.{name}.outer_radius", region.outer_radius)
+
+
+class WithAxes(Shape):
+    """Body whose local axes have a meaning, so that its elastin may be prestretched in them.
+
+    Its keyword arguments are the keys of `[geometry]`, as of every `Shape`.
+
+    Examples
+    --------
+    >>> from remodel_fenicsx.extend import SHAPES, WithAxes
+    >>> [name for name, shape in SHAPES.items() if issubclass(shape, WithAxes)]
+    ['cube', 'tendon', 'tube', 'sheet', 'mesh']
+    """
 
 
 class Unloads(Shape):

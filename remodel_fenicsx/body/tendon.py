@@ -11,7 +11,7 @@ from pydantic import Field, model_validator
 from remodel_fenicsx.body import gmsh_model as model
 from remodel_fenicsx.body.reductions import Strut, cylinder
 from remodel_fenicsx.body.shape import (
-    Shape,
+    WithAxes,
     axial_dead_force,
     cauchy_columns,
     check_lengths,
@@ -37,7 +37,7 @@ RINGS, ALONG = 2, 10
 CORE_RADIUS, CORE_ROUNDNESS = 0.65, 0.4
 
 
-class Tendon(Shape):
+class Tendon(WithAxes):
     """Cylinder along z, fixed at its bottom, pulled at its top: the tendon of the paper's Fig. 6.
 
     Length and square root of the area: 1e-6 to 1e6, one up to 10,000 times the other.

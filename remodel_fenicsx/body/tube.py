@@ -259,7 +259,9 @@ def _of_rings(release: str, m: Any) -> float:
         return float(getattr(residual_stress, release)(*arguments))
     except ArithmeticError as error:
         if m.domain.comm.rank == 0:
-            log.warning("time %g: no equilibrium without loads: %s", m.step.time, error)
+            log.warning(
+                "time %g: opening_angle or axial_stretch_in_vivo is NaN: %s", m.step.time, error
+            )
         return float("nan")
 
 
@@ -276,7 +278,7 @@ def _rings(m: Any) -> tuple[object, ...]:
         """Return the components around, along and across the wall."""
         return np.einsum("nia,nab,nib->ni", axes, tensors.reshape(-1, 3, 3), axes)
 
-    natural, closed = state.natural_gradient, state.kinematics.closing
+    natural, closed = state.natural_gradient, state.kinematics.closed_ring
 
     def at_first(radii: Array) -> Array:
         return np.ones((len(radii), 3)) if closed is None else closed.stretches(radii)

@@ -12,7 +12,7 @@ from typing import Any, ClassVar, NamedTuple, TYPE_CHECKING
 import numpy as np
 
 from remodel_fenicsx.body.gmsh_model import mesh_length_problem
-from remodel_fenicsx.body.shape import Column, Columns, Regions, Shape, Unloads, WithRegions
+from remodel_fenicsx.body.shape import Column, Columns, Regions, Unloads, WithAxes, WithRegions
 from remodel_fenicsx.model.axes import LocalAxes
 from remodel_fenicsx.model.cells import pitch_angle, radial_fraction
 from remodel_fenicsx.model.energy import Tissue
@@ -254,7 +254,7 @@ def _fitted_to_face(face: str, m: Any) -> Array:
     return np.linalg.solve(normal, right)[0]
 
 
-class Walled(Shape):
+class Walled(WithAxes):
     """Body with a wall, in which fibre angles are measured and `natural.layers` are allowed.
 
     Its keyword arguments are the keys of `[geometry]`, as of every `Shape`.

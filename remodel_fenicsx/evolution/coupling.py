@@ -32,8 +32,8 @@ log = logging.getLogger(__name__)
 # Record of a target at one point.
 TARGET = np.dtype([("direction", float, (3, 3)), ("switch", float), ("time", float)])
 NO_TIME = -1.0  # time of a target before the first one
-# Targets with a switch below this are ignored: they change the cells by less than the time error
-# of a step.
+# A point has its first target when the target's switch (1 under tension, 0 without; `tensor_law`)
+# reaches this. Below it the target changes the cells by less than the time error of a step.
 MIN_TARGET_WEIGHT = 0.01
 # Number of rates in the weighted sum that predicts the next rate, and number of known rates to
 # which its weights are fitted.
@@ -75,7 +75,8 @@ class Predictor:
         )
 
     def expected(self, step: LoadStep) -> Array | None:
-        """Return the prediction with boundary values and ghosts; None without earlier rates."""
+        """Return the prediction with boundary values and ghosts, or None."""
+        # There is none without earlier rates, or if the load rates have changed.
         speeds, state = self._speeds.values, self.state
         if not speeds or not self._has_same_load_rates(step):
             return None
@@ -90,8 +91,8 @@ class Predictor:
     def solved(self, step: LoadStep, before: Array, again: bool = False) -> None:
         """Record the rate of a solved step.
 
-        `before`: unknowns before the step. With `again`: unknowns after its first solve, and the
-        rate is added.
+        `before` holds the unknowns before the step. With `again` it holds those after the step's
+        first solve, and the rate is added to the recorded one.
         """
         unknown = self.state.unknown
         speed = np.asarray((unknown.x.array - before) / step.duration, dtype=np.float64)
@@ -112,7 +113,7 @@ class Predictor:
         )
 
     def _weights(self, speeds: list[Array]) -> Array:
-        """Fit the newest rates by the rates before them, by least squares. Collective."""
+        """Return the weights with which earlier rates fit the newest ones best. Collective."""
         rows = np.array([speed[: self.state.number_of_owned_unknowns] for speed in speeds])
         products = allreduce(self.state.comm, rows @ rows.T, MPI.SUM)
         matrix, right = np.zeros((SUMMED, SUMMED)), np.zeros(SUMMED)
@@ -205,7 +206,7 @@ class Coupling(Protocol):
         """
 
     def remodel(self, time: float) -> float:
-        """Compute the next step's cells, unless `solve` did; return the power of remodeling.
+        """Compute the next step's cells, unless `solve` does it; return the power of remodeling.
 
         Parameters
         ----------
@@ -352,14 +353,14 @@ class Staggered:
         before = unknown.copy()
         loading.set(loads)  # prescribed values are part of the prediction
         if not again and self._starts_as_expected(step):
-            if self._tried(FROM_EXPECTED, work, before) is None:
+            if not self._failure_of(FROM_EXPECTED, work, before):
                 return
         unknown[:] = before
         loading.set(old_loads)
         if self.equilibrium.extension().admissible:
             loading.set(loads)
-            failure = self._tried(FROM_LAST, work)
-            if failure is None:
+            failure = self._failure_of(FROM_LAST, work)
+            if not failure:
                 return
         else:
             say(FROM_LAST, "the remodeled cells exceed r = L at the previous displacement")
@@ -376,7 +377,7 @@ class Staggered:
         unknown.x.array[:] = expected
         return self.newton.is_admissible_start(self._last["extension"])
 
-    def _tried(
+    def _failure_of(
         self, attempt: Attempt, work: Work, step_start: Array | None = None
     ) -> SolveFailure | None:
         """Solve from the present unknowns, and return the failure or None."""
@@ -403,29 +404,31 @@ class Staggered:
         loading.set(old_loads)
         if self.blend is not None and self._has_remodeled():
             blend = self.blend
-            cell_change = (
+            cell_change = Continuation(
                 time,
                 "the change of the cells",
                 self._set_part,
                 self.state,
                 lambda: blend.newton,
+                halvings,
+                blend.largest_part,
+                loose_tolerance=True,
             )
-            Continuation(*cell_change, halvings, blend.largest_part, loose_tolerance=True).advance(
-                work
-            )
+            cell_change.advance(work)
             failure = None  # the loads were not yet tried from this state
 
         def set_load_fraction(fraction: float) -> None:
             loading.set(between(old_loads, new_loads, fraction))
 
-        load_change = (
+        load_change = Continuation(
             time,
             "the change of the loads",
             set_load_fraction,
             self.state,
             lambda: self.newton,
+            halvings,
         )
-        Continuation(*load_change, halvings).advance(work, failure)
+        load_change.advance(work, failure)
         loading.set(new_loads)
         log.info("time %g solved in %d substeps", time, work.substeps)
 
@@ -441,19 +444,12 @@ class Staggered:
                 self._set_part(fraction)
 
         halvings = self.settings.maximum_halvings
-        if blend is None:
-            return Continuation(
-                time, "the step", set_fraction, self.state, lambda: self.newton, halvings
-            )
-        return Continuation(
-            time,
-            "the step",
-            set_fraction,
-            self.state,
-            lambda: blend.newton,
-            halvings,
-            blend.largest_part,
+        change = Continuation(
+            time, "the step", set_fraction, self.state, lambda: (blend or self).newton, halvings
         )
+        if blend is not None:
+            change.largest_part = blend.largest_part
+        return change
 
     def _set_part(self, fraction: float) -> None:
         """Apply a fraction of the remodeling since the last solved state."""
@@ -538,7 +534,7 @@ class Extrapolated(Staggered):
         """Record the target of the solved state; the cells are already those of the row."""
         self._duration = time - self.state.time
         self._older[:] = self._newest
-        self._older["time"][self._has_first_target] = NO_TIME  # the target of its end was used
+        self._older["time"][self._has_first_target] = NO_TIME  # no target before the first
         self._newest["direction"], self._newest["switch"] = self._solved_target
         self._newest["time"] = time
         return self._power + self._after(time)

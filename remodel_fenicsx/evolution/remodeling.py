@@ -36,9 +36,10 @@ from remodel_fenicsx.state import StateNumbers, State, stress_rounding
 log = logging.getLogger(__name__)
 Array = NDArray[np.float64]
 
-# Bound of the stress error: this factor times residual / smallest face area. The residual is a
-# force at one node, an eighth of the nodes of an element, so its stress is up to 8 times the force
-# over the face area. A stress that is pulled back to the reference configuration is larger still.
+# Bound of the stress error: this factor times residual / smallest face area. The residual may
+# act at one of the eight nodes of an element alone, and then corresponds to a stress of up to 8
+# times the force over the face area. A stress that is pulled back to the reference configuration is
+# larger still.
 RESIDUAL_SHARE = 20.0
 # The bound that the residual gives is limited to this fraction of the body's stress. A tension
 # below the fraction carries hardly any load, and may be treated as zero.
@@ -106,7 +107,11 @@ class RemodelingPass(Remodels):
         self._expression = jit.expression(tensor, self.quadrature.points)
         self._cached_tensor: CachedValue[Array] = CachedValue(state.comm, tensor)
         self._target = self.law.target
-        if self._target is tensor_target and not settings.has_set_point and not uses_numpy():
+        if (
+            self._target is tensor_target
+            and not settings.changes_exponent_or_threshold
+            and not uses_numpy()
+        ):
             self._target = TensorKernels(state.comm).target  # exponent 2, no threshold
 
     @property
@@ -227,7 +232,7 @@ class RemodelingPass(Remodels):
     def updated_cells(
         self, time_old: float, time_new: float, residual: float = 0.0, cells: UnitCell | None = None
     ) -> tuple[UnitCell, Array]:
-        """Return cells after a pass of the present or other cells, and F (n, 3, 3)."""
+        """Return the present or other cells after a pass, and F (n, 3, 3)."""
         # Cells are flattened over the quadrature points. The state does not change.
         cells = self.state.cells.point_cells if cells is None else cells
         if self._averages_targets:
@@ -260,8 +265,8 @@ class RemodelingPass(Remodels):
     def inactive_fraction(self) -> float:
         """Return the volume fraction without a principal value above `remodeling.threshold`."""
         tensor = self.drive().tensor if self.further else self.driving_tensor()[1]
-        asleep = np.linalg.eigvalsh(tensor)[:, -1] <= self.settings.threshold
-        return float(self.quadrature.mean(asleep.reshape(self.quadrature.shape).astype(float)))
+        inactive = np.linalg.eigvalsh(tensor)[:, -1] <= self.settings.threshold
+        return float(self.quadrature.mean(inactive.reshape(self.quadrature.shape).astype(float)))
 
     def followed(self, target: Target, duration: float, cells: UnitCell | None = None) -> UnitCell:
         """Return the present or other cells after a time with a constant target; n points."""
@@ -285,7 +290,7 @@ class RemodelingPass(Remodels):
         return self.replace(full_pass, F, time_new - time_old, self.relaxation)
 
     def replace(self, full_pass: UnitCell, F: Array, duration: float, factor: float = 1.0) -> float:
-        """Replace the cells with a relaxation factor; return the power at frozen F."""
+        """Replace the cells by those of a relaxed pass; return the power at frozen F."""
         cells = self.state.cells
         self._last_pass = cells.point_cells.copy(), full_pass
         updated = self.law.relax(self._last_pass[0], full_pass, factor)

@@ -282,7 +282,8 @@ class LoadCaseSolver:
     Attributes
     ----------
     state, tissue, remodeling, coupling
-        The state, its tissue, the pass that computes its drive, and its coupling.
+        The state, its tissue, the pass that computes the driving tensor of its cells, and its
+        coupling.
     load_values
         Function of time that returns the magnitudes of all loads by name.
     each_case
@@ -297,7 +298,7 @@ class LoadCaseSolver:
     each_case: list[LoadCaseSolver]
 
     def adapt_watcher(self, watcher: Watcher) -> Watcher:
-        """Return a watcher of the stepper that passes on each step as that of this load case."""
+        """Return a watcher that passes each step to `watcher` with this load case's values."""
         return watcher
 
 
@@ -605,7 +606,7 @@ def equilibrate_prestretch(
     G, identity = state.natural_gradient, np.eye(3)
     if (
         G is None
-        or state.kinematics.closing is not None
+        or state.kinematics.closed_ring is not None
         or not state.cells.quadrature.maximum(np.abs(G - identity))
     ):
         return
@@ -672,7 +673,7 @@ def times(end: float, step: float) -> Iterator[float]:
 # ---------------------------------------------------------------- intended stops between two steps
 # A signal requests the stop, or the wall time limit requires it.
 
-MARGIN = 1.2  # largest expected wall time of the next step over that of earlier steps
+MARGIN = 1.2  # wall time allowed for the next step over that of the longest recent step
 NOT_ASKED, BY_SIGNAL, BY_CLOCK = range(3)
 REASONS = {BY_SIGNAL: "stopped by SIGUSR1", BY_CLOCK: "stopped before --max-wall-time is over"}
 

@@ -74,7 +74,7 @@ class Growth:
         return np.asarray(self.settings.volume * content / (self._reference * self.ratio))
 
     def set_initial(self, content: Array, ratio: Array) -> None:
-        """Set J_g, and m_ref so that it matches the content, from an earlier run."""
+        """Set J_g of an earlier run, and the m_ref with which the content gives this J_g."""
         volume = self.settings.volume
         self._reference[:] = content * volume / (ratio - 1.0 + volume)
         self.set(ratio)
@@ -137,7 +137,7 @@ class DecayMonitor:
 
 
 class TurnoverPass(Remodels):
-    """Turnover of content and natural length by the chain lengths of solved states."""
+    """Turnover of content and natural length; its rates follow from the solved chain lengths."""
 
     # The values are ln m and ln rho, (2, n).
 
@@ -184,7 +184,9 @@ class TurnoverPass(Remodels):
 
     # ------------------------------------------------------------ over a step
     def before(self, time: float, order: int) -> None:
-        """Change m and rho by the rates of the last row, or for order 2 by mid-step rates."""
+        """Change m and rho before the step is solved."""
+        # Order 1: over the last step, with the rates of its row. Order 2: over this step, with
+        # rates that are extrapolated to its middle.
         duration, last = time - self.state.time, self._numbers["duration"]
         rates = self.rates()
         self._numbers["duration"], self._start_rates = duration, None
@@ -273,7 +275,7 @@ class TurnoverPass(Remodels):
         self._slowing = DecayMonitor(dict(DecayMonitor.INITIAL))
 
     def without_rest(self, waiting: float) -> str:
-        """Return a message if the natural length grew much and rates decay no faster than 1/t."""
+        """Return text if the natural length changed much and rates decay no faster than 1/t."""
         goes_on = self._slowing.is_unbounded(
             waiting, self.quadrature.maximum(self.fastest_changes())
         )
@@ -308,11 +310,10 @@ class TurnoverPass(Remodels):
     def rates(self, present: bool = False) -> Array:
         """Return d ln m / dt and d ln rho / dt of the row, (2, n); mean over load cases."""
         states = (self.state, *self.state.other_cases)
-        rates = [np.array(self._rates(state, present)) for state in states]
         return np.asarray(
             sum(
-                weight * case_rates
-                for weight, case_rates in zip(self.state.weights, rates, strict=True)
+                weight * np.array(self._rates(state, present))
+                for weight, state in zip(self.state.weights, states, strict=True)
             )
         )
 

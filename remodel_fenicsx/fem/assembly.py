@@ -22,7 +22,7 @@ from ufl.domain import extract_unique_domain
 
 from remodel_fenicsx.fem import jit
 from remodel_fenicsx.fem.kinematics import lagrange
-from remodel_fenicsx.fem.solver_methods import ProblemOptions, multigrid_options
+from remodel_fenicsx.fem.solver_methods import ProblemOptions, levels_options
 
 if TYPE_CHECKING:
     from dolfinx.fem import Constant, DirichletBC, Form, Function, FunctionSpace
@@ -57,35 +57,19 @@ def degree_one(space: FunctionSpace) -> tuple[FunctionSpace, PETSc.Mat]:
 
 
 class PMultigrid:
-    """Multigrid for elements of degree 2, with `degree_one` as the next level. Collective."""
+    """Multigrid for elements of degree 2, with `degree_one` as the lower level. Collective."""
 
-    # All coarser levels then cost little.
+    # A factor of the lower level is cheap: it has an eighth of the unknowns.
 
-    def __init__(
-        self,
-        pc: PETSc.PC,
-        next_level: tuple[FunctionSpace, PETSc.Mat],
-        matrix: PETSc.Mat,
-        elastic: bool,
-    ):
-        below, self._prolongation = next_level
+    def __init__(self, pc: PETSc.PC, below: tuple[FunctionSpace, PETSc.Mat], matrix: PETSc.Mat):
+        _, self._prolongation = below
         self._coarse = matrix.PtAP(self._prolongation)
-        self._coarse.setBlockSize(below.dofmap.bs)
-        if elastic:
-            self._coarse.setNearNullSpace(rigid_body_modes(below, self._coarse))
-        self._options = ProblemOptions(multigrid_options(), {})
+        self._options = ProblemOptions(levels_options(matrix.comm.size), {})
         pc.setType("mg")
         pc.setMGLevels(2)
-        pc.setMGType(PETSc.PC.MGType.ADDITIVE)
         pc.setMGInterpolation(1, self._prolongation)
-        fine, coarse = pc.getMGSmoother(1), pc.getMGCoarseSolve()
-        # A prefix of its own: GAMG's options are not for this level.
-        fine.setOptionsPrefix(self._options.prefix + "fine_")
-        fine.setType("preonly")
-        fine.getPC().setType("pbjacobi")
-        coarse.setOperators(self._coarse)
-        coarse.setType("preonly")
-        self._options.apply(coarse.getPC())
+        pc.getMGCoarseSolve().setOperators(self._coarse)
+        self._options.apply(pc)
 
     def renew(self, matrix: PETSc.Mat) -> None:
         """Compute the next level for another matrix. Collective."""
@@ -141,7 +125,7 @@ class SpdSolver:
         solver.getPC().setType("gamg" if multigrid else "jacobi")
         levels = None
         if multigrid and self.space.ufl_element().degree > 1:
-            levels = PMultigrid(solver.getPC(), self._degree_one, matrix, elastic=False)
+            levels = PMultigrid(solver.getPC(), self._degree_one, matrix)
         solver.setInitialGuessNonzero(True)
         solver.setTolerances(rtol=TOLERANCE, max_it=ITERATION_LIMIT)
         solver.solve(load, answer)

@@ -50,7 +50,7 @@ class Kinematics(ABC):
         Whether the strain is the same everywhere, so that results do not depend on the mesh.
     suits_multigrid
         Whether algebraic multigrid converges for these unknowns.
-    closing
+    closed_ring
         Closed ring of a tube with residual stress (`model.residual_stress.ClosedRing`); otherwise
         None.
     grows
@@ -74,7 +74,7 @@ class Kinematics(ABC):
     homogeneous: ClassVar[bool] = False
     suits_multigrid: ClassVar[bool] = True
     cost: ClassVar[float] = 1.0
-    closing: Any = None
+    closed_ring: Any = None
     grows: ClassVar[bool] = False
 
     def element(self, kind: str) -> str:
@@ -411,6 +411,7 @@ class _KinematicsWrapper:
         return self.elastic(self.deformation_gradient(unknown))
 
 
+@with_old_names
 class NaturalConfiguration(_KinematicsWrapper):
     """Body with a stress-free (natural) configuration; G leads from it to the mesh, F_e = F G."""
 
@@ -421,11 +422,11 @@ class NaturalConfiguration(_KinematicsWrapper):
         self,
         kinematics: Kinematics,
         gradient: Expr,
-        closing: Any = None,
+        closed_ring: Any = None,
         initial: Expr | None = None,
     ):
         self.field, self.gradient = kinematics, gradient
-        self.closing = closing
+        self.closed_ring = closed_ring
         self.initial, self.grows = (gradient, False) if initial is None else (initial, True)
 
     def elastic(self, deformation_gradient: Expr) -> Expr:

@@ -20,7 +20,6 @@ from functools import partial
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from remodel_fenicsx._renamed import with_old_names
 from remodel_fenicsx._lazy import Late
@@ -36,10 +35,9 @@ from remodel_fenicsx.model.chains import (
     UflOrArray,
     WithParameters,
 )
-from remodel_fenicsx.model.tensors import det, is_array, ln, sqrt, squared_norm
+from remodel_fenicsx.model.tensors import Array, det, is_array, ln, sqrt, squared_norm
 
 ufl = Late("ufl")
-Array = NDArray[np.float64]
 Term = Formula[UflOrArray]  # of F or J, lambda and mu
 TURNED_OVER = ("content", "natural_length")  # parameters that turnover changes at every point
 ELASTIN = ("elastin_circumferential", "elastin_axial")  # prestretch of the matrix
@@ -439,8 +437,8 @@ class Tissue:
         Prestretch of the matrix, whose radial stretch keeps the volume: det G_e = 1. None without
         prestretch.
     elastin_axes
-        Circumferential, axial and radial unit vectors as rows, (3, 3) or (..., 3, 3); None for
-        `AXES_ON_THE_RADIUS`.
+        Circumferential, axial and radial unit vectors as rows, (3, 3) or (..., 3, 3); by default
+        those of the kinematics on one radius, y, z and x.
 
     Examples
     --------
@@ -470,7 +468,7 @@ class Tissue:
     natural_length: UflOrArray = None
     elastin_circumferential: UflOrArray = None
     elastin_axial: UflOrArray = None
-    elastin_axes: UflOrArray = field(default=None, compare=False)
+    elastin_axes: UflOrArray = field(default_factory=AXES_ON_THE_RADIUS.copy, compare=False)
 
     @property
     def locking_length(self) -> UflOrArray:
@@ -587,7 +585,7 @@ class Tissue:
         F = deformation_gradient
         if self.elastin_axial is None:
             return F
-        axes = AXES_ON_THE_RADIUS if self.elastin_axes is None else self.elastin_axes
+        axes = self.elastin_axes
         if is_array(F):
             return F @ tensors.stretch_tensor(self.elastin_prestretch, axes)
         directions = enumerate(self.elastin_stretches)

@@ -168,7 +168,7 @@ class Law:
         Function of (old, new, factor) that returns relaxed cells; default: `relaxed`.
     over_corrects
         Whether the coupling "staggered" may leave a symmetric solution with this law.
-    takes_set_points
+    uses_exponent_and_threshold
         Whether `target` uses the exponent and the threshold of the drive, and the law is compatible
         with turnover.
     parameters
@@ -212,7 +212,7 @@ class Law:
     keeps_symmetry: bool = False
     stops_at_zero_kappa: bool = False
     over_corrects: bool = False
-    takes_set_points: bool = False
+    uses_exponent_and_threshold: bool = False
     parameters: Mapping[str, Parameter] = field(default=NO_PARAMETERS, compare=False)
     speed: Formula[float] | None = None
 
@@ -453,7 +453,7 @@ LAWS: dict[str, Law] = {
         follow=follow_tensor,
         keeps_symmetry=True,
         stops_at_zero_kappa=True,
-        takes_set_points=True,
+        uses_exponent_and_threshold=True,
     ),
     "rotation": Law(rotation, relax=rotate_partially),
     "none": Law(keep, remodels=False, keeps_symmetry=True),

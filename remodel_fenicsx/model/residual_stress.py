@@ -12,9 +12,8 @@ from numpy.typing import NDArray
 from remodel_fenicsx.model.cells import UnitCell
 from remodel_fenicsx.model.energy import Tissue
 from remodel_fenicsx.model.laws import COMPLEX_STEP
+from remodel_fenicsx.model.tensors import Array, stretch_tensor
 from remodel_fenicsx.schema.tables import SceneError
-
-Array = NDArray[np.float64]
 
 # Polynomial degree of R(r). The paper's artery at 160 degrees changes by less than 1e-8 from 16 to
 # 32.
@@ -37,10 +36,6 @@ TANGENT_DIFFERENCE = 1e-7  # difference of a logarithm; Newton's method needs no
 # error of half of it.
 CHECK_DIFFERENCE, CHECKED = 1e-4, 1e-2
 UNSTRETCHED = (1.0, 1.0, 1.0)
-ON_THE_RADIUS = [2, 0, 1]
-"""Order of the axes in the energy: x, y, z of the kinematics on one radius are radial,
-circumferential and axial. All other arrays here are circumferential, axial, radial, as the rows of
-local axes."""
 
 
 # ---------------------------------------------------------------- functions of the radius on panels
@@ -184,7 +179,7 @@ def close_ring(layers: Sequence[Layer], opening_angle: float, loads: Loads = Loa
         ]
         if len(pieces) > MOST_POLYNOMIALS * len(layers):
             raise ArithmeticError(
-                f"ring and sector vary too much through the wall for {len(pieces)} polynomials"
+                f"the stretches vary too steeply through the wall for {len(pieces)} polynomials"
             )
         finer = Panels([pieces[0].radii[0], *(piece.radii[1] for piece in pieces)], DEGREE)
         radius = ring.natural_radius(finer.places)
@@ -318,8 +313,8 @@ def principal_stresses(
 def fresh_stretches(tissue: Tissue) -> Array:
     """Return the principal stretches of G, (3,), that make fresh tissue stress-free.
 
-    With a prestretch of elastin, matrix and isotropic cells balance at these circumferential, axial
-    and radial stretches.
+    With a prestretch of elastin, matrix and isotropic cells balance at these stretches along its
+    axes.
     """
     if tissue.elastin_axial is None:
         return np.ones(3)
@@ -334,13 +329,14 @@ def fresh_stretches(tissue: Tissue) -> Array:
 
 
 def _energy(tissue: Tissue, stretches: Array, dimensions: Array | None) -> Array:
-    """Return W (...) at stretches (..., 3) along the axes of the cells."""
+    """Return W (...) at stretches (..., 3) along the axes of the cells, those of elastin."""
     length = np.broadcast_to(
         tissue.end_to_end_length / np.sqrt(3.0) if dimensions is None else dimensions,
         stretches.shape,
     )
-    cell = UnitCell(length[..., ON_THE_RADIUS], np.broadcast_to(np.eye(3), (*stretches.shape, 3)))
-    return np.asarray(tissue.strain_energy(stretches[..., ON_THE_RADIUS, None] * np.eye(3), [cell]))
+    axes = tissue.elastin_axes
+    cell = UnitCell(length, np.broadcast_to(axes, (*stretches.shape, 3)))
+    return np.asarray(tissue.strain_energy(stretch_tensor(stretches, axes), [cell]))
 
 
 def _check_complex(tissue: Tissue, stretches: Array, dimensions: Array | None) -> None:

@@ -444,7 +444,7 @@ def _support_force(equilibrium: Equilibrium, face: str) -> Callable[[], float]:
     if domain.boundary.goes_around(face):
         raise SceneError(
             f"output.columns = 'support_force_{face}': the face goes around the body, "
-            "so that there is no direction"
+            "so that the force has no direction; choose a part of it, or another face"
         )
     if (potential := state.loading.supports[face]) is not None:
         form = jit.form(

@@ -125,8 +125,8 @@ def export(
     share = unevenness(fibres.elements, fibres.tensors)
     if fibres.elements.shape[1] > 4 and share > LEAST_SAID:
         log.warning(
-            "each element has the mean of its points: at nodes they differ by up to %.1f %% "
-            "of tr A, and a run that begins with them has an error of up to about as much there",
+            "the file has one mean per element: at a node elements differ from their mean by up "
+            "to %.1f %% of tr A, and a run that starts from the file has about this error there",
             100 * share,
         )
     path = Path(folder) / f"fibres{ending}" if path is None else path

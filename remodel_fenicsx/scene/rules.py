@@ -11,7 +11,7 @@ from collections import Counter
 
 from remodel_fenicsx.body import SHAPES
 from remodel_fenicsx.body.reductions import AUTO, choice, objections, too_many_elements
-from remodel_fenicsx.body.shape import FromFile, Unloads, WithRegions
+from remodel_fenicsx.body.shape import FromFile, Unloads, WithAxes, WithRegions
 from remodel_fenicsx.body.wall import RoundWall, Walled
 from remodel_fenicsx.fem.formulations import FORMULATIONS
 from remodel_fenicsx.fem.kinematics import KINEMATICS
@@ -222,12 +222,13 @@ def natural_state(scene: Scene) -> Faults:
     """Check that shape, formulation and cells allow residual stress."""
     natural, shape = scene.natural, scene.geometry
     able, none = Walled, "absent"
-    if scene.is_stress_free or natural.fibres:
+    if scene.is_stress_free:
         return
     value: object
     key, value = "natural.layers", None
     for name, properties in scene.properties().items():
-        if properties.material.has_elastin:
+        if properties.material.has_elastin and (isinstance(shape, Walled) or not natural.layers):
+            able = WithAxes
             key, none = f"{in_region(name)}material.elastin.prestretch", "[1.0, 1.0]"
             value = properties.material.elastin.prestretch
             break
@@ -249,6 +250,8 @@ def natural_state(scene: Scene) -> Faults:
                     "'isotropic'",
                 )
             )
+    if natural.fibres:  # the file has cells and G; a prestretch of elastin still needs axes
+        del needs[able is WithAxes :]
     for other, has, possible in needs:
         if not has:
             yield f"must be {none} unless {other} is {possible}", key, value

@@ -203,8 +203,8 @@ class Elastin(Table):
         default=(1.0, 1.0), json_schema_extra={"allowed": "two numbers greater than 0"}
     )
     """Circumferential and axial stretch of elastin beyond that of collagen deposited at the start;
-    its radial stretch keeps the volume. Fresh tissue stays stress-free. In the body's local
-    axes."""
+    its radial stretch keeps the volume. Fresh tissue stays stress-free. In the body's local axes:
+    of a sheet x and y, of a cube or tendon y and the axis of the load, z."""
 
 
 @with_old_names
@@ -539,7 +539,7 @@ class Cells(Table):
 
         The result has shape (number_of_elements, 3). Every rank draws the complete list of random
         cells in the mesh file's order. An element therefore has the same draw on any number of
-        ranks.
+        ranks. Cells that a file has are NaN.
         """
         r0 = self.end_to_end_length
         if self.initial == "random":
@@ -554,6 +554,8 @@ class Cells(Table):
             lengths = [r0 / np.sqrt(3)] * 3
         elif self.initial == "aligned":
             lengths = [r0 if axis == self.aligned_axis else 0.0 for axis in (1, 2, 3)]
+        elif self.initial == MEASURED_CELLS:
+            lengths = [np.nan] * 3
         return np.tile(np.array(lengths), (number_of_elements, 1))
 
 
@@ -769,6 +771,7 @@ REMODELS = {"turnover": RemodelsKind(Turnover, "remodel_fenicsx.evolution.turnov
 """Quantities that remodel in addition to the cells, by the name of their `[remodeling]` table."""
 
 
+@with_old_names
 class Remodeling(Table):
     """Evolution of the cells under load: driving tensor, evolution law, frame and rate.
 
@@ -878,22 +881,22 @@ class Remodeling(Table):
         return kappa if speed is None else float(speed(kappa, temperature, **self.own_parameters))
 
     @property
-    def has_set_point(self) -> bool:
+    def changes_exponent_or_threshold(self) -> bool:
         """Whether exponent or threshold differs from the paper's."""
         return self.exponent != 2.0 or self.threshold != 0.0
 
     def _faults(self) -> Faults:
         law, driver = LAWS[self.law], DRIVERS[self.driver]
         coupling = COUPLINGS[self.coupling]
-        able = join_names(LAWS, lambda law: law.takes_set_points)
+        able = join_names(LAWS, lambda law: law.uses_exponent_and_threshold)
         for key, plain in (("exponent", 2), ("threshold", 0)):
-            if getattr(self, key) != plain and not law.takes_set_points:
+            if getattr(self, key) != plain and not law.uses_exponent_and_threshold:
                 yield f"must be {plain} unless remodeling.law is {able}", key, getattr(self, key)
         if self.threshold and not driver.is_stress:
             drivers = join_names(DRIVERS, lambda driver: driver.is_stress)
             rule = f"must be 0 unless remodeling.driver is a stress: {drivers}"
             yield rule, "threshold", self.threshold
-        if self.turnover.is_on and not law.takes_set_points:
+        if self.turnover.is_on and not law.uses_exponent_and_threshold:
             yield f"needs remodeling.law = {able}", "turnover", None
         if self.turnover.is_on and not coupling.takes_turnover:
             able = join_names(COUPLINGS, lambda kind: kind.takes_turnover)
@@ -1218,13 +1221,14 @@ class Solver(Table):
         default=AUTO,
         description=f"Solver of each step's equations. 'auto' takes 'direct' up to {MAX_DIRECT_3D} "
         f"unknowns ({MAX_DIRECT_REDUCED} of a reduction), then 'lagged', and above "
-        f"{MIN_MULTIGRID} 'iterative'. {meanings(SOLVER_METHODS)} "
+        f"{MIN_MULTIGRID} 'iterative' where a factorisation costs more. {meanings(SOLVER_METHODS)} "
         "(docs/speed_and_accuracy.md).",
     )
     predictor: Literal["none", "autoregressive", "with-tolerance"] = "autoregressive"
     """Start of Newton's method in a step. 'none': the displacement of the previous step.
     'autoregressive': a prediction from the last increments. 'with-tolerance': a prediction only
-    with adaptive steps (time.tolerance). The solutions agree to the tolerance."""
+    in adaptive steps (time.tolerance) and on the path to the steady state (time.end =
+    'equilibrium'). The solutions agree to the tolerance."""
     absolute_tolerance: Annotated[float, FORCE] = Field(default=0.0, ge=0)
     """A force: a step is solved if |R| <= absolute_tolerance + relative_tolerance |nodal
     forces|."""

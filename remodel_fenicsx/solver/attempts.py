@@ -28,7 +28,7 @@ FROM_EXPECTED = Attempt(
 )
 FROM_LAST = Attempt("from the last displacement", "Staggered", "{reason}; solving in substeps")
 MADE_ANEW = Attempt(
-    "in each solve: again, with a new factorisation or new multigrid levels in every iteration",
+    "in each solve: again, with a new factorisation in every iteration, or instead of multigrid",
     "FullNewton.fallback",
     "Newton failed ({reason}); retrying {how}",
 )

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import os
 from collections import deque
 from collections.abc import Iterator
 from contextlib import AbstractContextManager, contextmanager, nullcontext
@@ -18,6 +19,7 @@ from remodel_fenicsx.fem.assembly import PMultigrid, degree_one, allreduce, rigi
 from remodel_fenicsx.fem.solver_methods import (
     DEFINITE,
     GENERAL,
+    LAGGED,
     ProblemOptions,
     SYMMETRIC,
     factor_options,
@@ -93,6 +95,13 @@ SLOW_STEP = 2 / 3
 # Number of factorisations in a solve. If it needs more, lagging is not the cause: the solve
 # continues as Newton's method for as many more.
 MOST_RENEWALS = 6
+# Iterations of a linear solve up to which the next one has the same preconditioner. New levels cost
+# about as much as 20 iterations.
+KEPT_LEVELS = 20
+# Operations of a factorisation per entry of the tangent up to which a few factorisations cost less
+# than multigrid: 6,200 in a branching wall of 250,000 unknowns, 10,700 in a stout one of 306,000.
+CHEAP_FACTOR = 10_000
+FACTOR_BYTES = 13  # memory of a factorisation per entry of the factor, measured with CHOLMOD
 
 # Relative tolerance of a linear solve that may be the last one: SURELY times the required
 # reduction, if above LAST.
@@ -263,7 +272,7 @@ class FullNewton:
     """
 
     given_up = False  # whether the solve shall stop
-    keeps = False  # whether a factorisation is reused in later solves
+    reuses_factorisation = False  # whether a factorisation is reused in later solves
 
     def __init__(self, equilibrium: Equilibrium, snes: SNES, matrix: Mat, options: ProblemOptions):
         self.equilibrium, self.snes = equilibrium, snes
@@ -340,66 +349,97 @@ class FullNewton:
 
 
 class Multigrid(FullNewton):
-    """GMRES with multigrid: new levels per tangent below degree 2, otherwise by PETSc's options."""
+    """GMRES with multigrid, and with a factorisation once multigrid has failed."""
 
     def __init__(self, equilibrium: Equilibrium, snes: SNES, matrix: Mat, options: ProblemOptions):
         super().__init__(equilibrium, snes, matrix, options)
-        self._solver, self._space = snes.getKSP(), equilibrium.state.unknown.function_space
+        self._solver = snes.getKSP()
         self._far = self._solver.getTolerances()[0]  # tolerance far from the solution
-        self._below: PMultigrid | None = None
+        self._levels: PMultigrid | None = None
+        self._factor: LaggedFactorisation | GatheredFactor | None = None
+        space, given = equilibrium.state.unknown.function_space, options.given
+        self._chooses = False
         if equilibrium.state.kinematics.reduced:
             return
-        given = {name.split("_")[0] for name in options.given}
-        self._chooses = "ksp" not in given and "snes_ksp_ew" not in options.given
-        if self._space.ufl_element().degree > 1 and not given & {"pc", "mg"}:
-            self._below = PMultigrid(
-                self._solver.getPC(), degree_one(self._space), matrix, elastic=True
-            )
-            if self._chooses:
-                # The tolerance is then that of the residual itself.
-                self._solver.setPCSide(PETSc.PC.Side.RIGHT)
+        self._chooses = not any(name.startswith(("ksp", "snes_ksp_ew")) for name in given)
+        if self._chooses:
+            # The tolerance is then that of the residual itself.
+            self._solver.setPCSide(PETSc.PC.Side.RIGHT)
+        if space.ufl_element().degree > 1 and not any(name[:2] in ("pc", "mg") for name in given):
+            self._levels = PMultigrid(self._solver.getPC(), degree_one(space), matrix)
         else:
-            matrix.setNearNullSpace(rigid_body_modes(self._space, matrix))
+            matrix.setNearNullSpace(rigid_body_modes(space, matrix))
 
     def tangent(self, norm: float, tolerance: float) -> None:
         super().tangent(norm, tolerance)
-        if self._below is not None and self._chooses:
+        if self._chooses:
             last = SURELY * tolerance / norm
             self._solver.setTolerances(rtol=last if last > LAST else self._far)
 
     def renew(self) -> None:
         super().renew()
-        if self._below is not None:
-            self._below.renew(self.matrix)
-        if self._below is not None or self._always:
-            self._set_up()
+        if self._factor is not None:
+            self._factor.renew(self.matrix)
+            return
+        if self.tangents > 1 and self._solver.getIterationNumber() <= KEPT_LEVELS:
+            return
+        if self._levels is not None:
+            self._levels.renew(self.matrix)
+        self._set_up()
+        self._solver.getPC().setReusePreconditioner(True)
 
     def fallback(self) -> tuple[str, AbstractContextManager[None]] | None:
-        if self._below is None:
-            return "with new multigrid levels in every iteration", self._anew()
-        if self.snes.getConvergedReason() != PETSc.SNES.ConvergedReason.DIVERGED_LINEAR_SOLVE:
+        failed = self.snes.getConvergedReason() == PETSc.SNES.ConvergedReason.DIVERGED_LINEAR_SOLVE
+        if self._factor is not None or not failed:
             return None
-        # Nearly incompressible tissue needs levels of the matrix itself, and an error norm measured
-        # by them.
         self.close()
-        self._solver.getPC().setFromOptions()
-        self.matrix.setNearNullSpace(rigid_body_modes(self._space, self.matrix))
-        if self._chooses:
-            self._solver.setPCSide(PETSc.PC.Side.LEFT)
-            self._solver.setNormType(PETSc.KSP.NormType.PRECONDITIONED)
-            self._solver.setTolerances(rtol=self._far)
-        return "with multigrid levels of the matrix from now on", nullcontext()
+        self._factor = kept_factor(self.equilibrium.comm)
+        preconditioner = self._solver.getPC()
+        preconditioner.setType(PETSc.PC.Type.PYTHON)
+        preconditioner.setPythonContext(self._factor)
+        return "with a factorisation from now on", nullcontext()
 
     def close(self) -> None:
-        if self._below is not None:
-            self._below.destroy()
-        self._below = None
+        if self._levels is not None:
+            self._levels.destroy()
+        if self._factor is not None:
+            self._factor.close()
+        self._levels = self._factor = None
+
+
+def cheaper_method(matrix: Mat) -> str:
+    """Return the method for a large tangent, by the cost of factorising it. Collective."""
+    # One megabyte is too little for the factor, so that MUMPS ends after its analysis.
+    options = ProblemOptions(factor_options(SYMMETRIC) | {"mat_mumps_icntl_23": 1}, {})
+    preconditioner = PETSc.PC().create(matrix.comm)
+    preconditioner.setOperators(matrix)
+    options.apply(preconditioner)
+    preconditioner.setUp()
+    factor = preconditioner.getFactorMatrix()
+    operations, entries = factor.getMumpsRinfog(1), factor.getMumpsInfog(20)
+    preconditioner.destroy()
+    options.close()
+    size = FACTOR_BYTES * (entries if entries > 0 else -1e6 * entries)  # negative: millions
+    nonzeros = matrix.getInfo(PETSc.Mat.InfoType.GLOBAL_SUM)["nz_used"]
+    memory = os.sysconf("SC_AVPHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")
+    is_cheap = operations < CHEAP_FACTOR * nonzeros and size < memory
+    method = LAGGED if is_cheap else "iterative"
+    log.info(
+        "solver.method 'auto' takes %r: a factorisation needs %.1e operations, %.0f for each entry "
+        "of the tangent, and %.1f GB of %.1f",
+        method,
+        operations,
+        operations / nonzeros,
+        size / 1e9,
+        memory / 1e9,
+    )
+    return str(allreduce(matrix.comm.tompi4py(), method, MPI.MAX))
 
 
 class Lagged(FullNewton):
     """Modified Newton with L-BFGS: the tangent is renewed if more iterations would cost more."""
 
-    keeps = True
+    reuses_factorisation = True
     # Whether each solve factorises first, and one slow iteration suffices to do so again.
     _begins_anew = False
 

@@ -24,7 +24,7 @@ from remodel_fenicsx.fem.solver_methods import (
 from remodel_fenicsx.schema.settings import Solver
 from remodel_fenicsx.solver.attempts import MADE_ANEW, attempted, say
 from remodel_fenicsx.solver.equilibrium import Equilibrium, StateLimits, PointState
-from remodel_fenicsx.solver.linear import FullNewton
+from remodel_fenicsx.solver.linear import FullNewton, cheaper_method
 from remodel_fenicsx.state import stress_rounding
 from remodel_fenicsx.system.interrupts import Interrupted
 
@@ -36,8 +36,8 @@ Array = NDArray[np.float64]
 # The residual must not exceed a tolerance. The tolerance is at least the rounding error.
 
 FORCE_ROUNDINGS = 8.0  # accepted residual over the rounding error of assembled forces
-# Accepted residual over the rounding error of displacements. On thin and on stiff walls 0.07 to 4
-# was measured.
+# Accepted residual over the force that rounded displacements cause: a strain of eps |u|/h. On thin
+# and on stiff walls 0.07 to 4 was measured.
 ROUNDED_STRAINS = 8.0
 # Largest error of a prescribed displacement, relative to the body's size. It needs a tolerance of
 # its own, because the residual is zero at constrained dofs.
@@ -50,8 +50,8 @@ PRESCRIBED_ROUNDING = 1e-13
 INTERMEDIATE_TOLERANCE = 1e-5
 NEARLY_STRAIGHT = 0.99  # r/L above which the rounding error of one point may dominate
 COARSE = 1e-8  # tolerance over nodal forces above which that error does dominate
-# Residual over the previous one above which Newton's method stagnates. A residual that only
-# rounding errors allow is accepted only then, also if no chain is nearly straight.
+# Residual over the previous one above which Newton's method stagnates. Only then
+# rounding errors of displacements excuse a residual; with nearly straight chains all of them.
 STAGNATION = 0.25
 
 
@@ -63,7 +63,9 @@ class Convergence:
         quadrature = equilibrium.quadrature
         areas, gradients = quadrature.largest_areas, quadrature.gradients
         self._area = quadrature.norm(areas)
-        self._area_of_gradients = quadrature.norm(areas * gradients)  # per displacement
+        self._area_times_gradient = quadrature.norm(
+            areas * gradients
+        )  # times stress and displacement: a force
         self.force_scale = self.max_chain_extension = self.displacement = 0.0
         self.prescribed_gap, self.intermediate = float("inf"), False
         self.begin()
@@ -96,13 +98,13 @@ class Convergence:
         coarse = (
             self.max_chain_extension > NEARLY_STRAIGHT and tolerance > COARSE * self.force_scale
         )
-        certain = requested if coarse else self.tolerance(rounded_strains=0.0)
-        return norm <= certain or norm > STAGNATION * previous
+        accepted_at_once = requested if coarse else self.tolerance(rounded_strains=0.0)
+        return norm <= accepted_at_once or norm > STAGNATION * previous
 
     def goal(self) -> float:
         """Return the approximate norm of the residual at which the solve ends."""
-        coarse = INTERMEDIATE_TOLERANCE * self.force_scale if self.intermediate else 0.0
-        return max(coarse, self.tolerance())
+        intermediate = INTERMEDIATE_TOLERANCE * self.force_scale if self.intermediate else 0.0
+        return max(intermediate, self.tolerance())
 
     def tolerance(self, rounded_strains: float = ROUNDED_STRAINS) -> float:
         """Return the tolerance in the unit of force, at least the rounding error of forces."""
@@ -111,7 +113,7 @@ class Convergence:
         relative = self.settings.relative_tolerance * self.force_scale
         area = (
             FORCE_ROUNDINGS * self._area
-            + rounded_strains * self.displacement * self._area_of_gradients
+            + rounded_strains * self.displacement * self._area_times_gradient
         )
         return self.settings.absolute_tolerance + max(relative, self._stress_rounding * area)
 
@@ -119,11 +121,14 @@ class Convergence:
 # ---------------------------------------------------------------- admissible states
 # The limits r < L and J > 0 in the line search of Newton's method.
 
-# If a Newton step would end above the first number, an r/L, each point there keeps at least the
-# second number times its 1 - r/L before the step.
+# Where a Newton step ends with r/L above NEAR_LIMIT, the point must keep at least the fraction
+# RESERVE of the 1 - r/L that it had before the step.
 NEAR_LIMIT, RESERVE = 0.95, 0.3
 NOWHERE = StateLimits(0.0, 1.0, (np.nan,) * 3)
 LINE_SEARCH_HALVINGS = 20  # number of halvings of a Newton step before the line search fails
+# Number of Newton steps in a row, and of halvings of each, after which a solve fails. Solves that
+# succeed have at most two such steps; on a thin wall under too much load all steps are as short.
+SHORT_STEPS, SHORT_STEP_HALVINGS = 4, 6
 # Smallest displacement of a jump, relative to the body's size; for a tube ten radii long this is
 # 1 % of its radius.
 POSSIBLE_JUMP = 1e-3
@@ -185,6 +190,7 @@ class _Solve:
     # All states whose |dF| from the last evaluated state is below this are admissible.
     safe_change: float = 0.0
     is_certain: bool = False  # whether the state is one of them
+    short_steps: int = 0  # number of Newton steps in a row that the guards have made very short
 
 
 # By PETSc's SNESConvergedReason, as numbers, because the names differ between its versions.
@@ -192,6 +198,7 @@ SNES_REASONS = {
     -3: "the linear solver failed",
     -4: "overflow or NaN in the residual; check units and magnitudes of loads and parameters",
     -6: "the line search did not reduce the residual",
+    -8: "the guards r < L and J > 0 make all Newton steps too short",
     -9: "the residual diverged",
 }
 DIVERGED_MAX_IT = -5
@@ -233,17 +240,16 @@ class GuardedNewton:
         self.method = method = resolve_auto(
             settings.method, unknowns, is_reduced, kinematics.suits_multigrid
         )
-        # In three dimensions a named method is not replaced, so that results do not depend on the
-        # size.
+        if method != settings.method and method == "iterative":
+            self.method = method = cheaper_method(self._matrix)
+        # In three dimensions PETSc's LU replaces MUMPS only with 'auto', so that the results of a
+        # named method do not depend on the size.
         small = is_small(unknowns, is_reduced) and (is_reduced or settings.method == AUTO)
         self._options = ProblemOptions(method_options(method, ranks, small), settings.petsc_options)
-        bounded = (
+        self._uses_safe_change = (
             method == LAGGED
             and not self._robust
             and "snes_linesearch_type" not in self._options.given
-        )
-        self._bounded = (
-            bounded
             and kinematics.three_dimensional
             and equilibrium.state.dilatation.jacobian is None
         )
@@ -289,7 +295,7 @@ class GuardedNewton:
         )
         if isinstance(first, Solution):
             return first
-        second = self._linear.fallback()
+        second = None if self._present.short_steps >= SHORT_STEPS else self._linear.fallback()
         if second is None:
             raise first
         words, other_way = second
@@ -302,7 +308,7 @@ class GuardedNewton:
         return again
 
     def is_admissible_start(self, last_extension: float) -> bool:
-        """Return whether a solve may start here: admissible, and not too near to locking."""
+        """Return whether a solve may start here: admissible, and not too near to r = L."""
         extension, least = self.equilibrium.extension(), RESERVE * (1 - last_extension)
         near = (
             extension.max_chain_extension > NEAR_LIMIT and 1 - extension.max_chain_extension < least
@@ -353,7 +359,8 @@ class GuardedNewton:
     def newton_correction(self, equilibrium: Equilibrium, tangents: int) -> Array:
         """Return the Newton step for `equilibrium`. Collective.
 
-        `tangents`: number of tangents assembled for this state; if 0, one is assembled.
+        `tangents`: number of tangents assembled for this state; if 0, one is assembled, except by a
+        method that reuses factorisations.
         """
         self._to_petsc(self._x)
         equilibrium.assemble_internal(self._residual)
@@ -362,7 +369,7 @@ class GuardedNewton:
         dolfinx.fem.petsc.set_bc(
             self._residual, equilibrium.state.loading.boundary_conditions, self._x, -1.0
         )
-        if not (self._linear.tangents if self._linear.keeps else tangents):
+        if not (self._linear.tangents if self._linear.reuses_factorisation else tangents):
             self._linear.renew()
         solver, direction = self._snes.getKSP(), self._x.duplicate()
         solver.setOperators(self._matrix)
@@ -429,7 +436,9 @@ class GuardedNewton:
             present.inadmissible = not extension.admissible or extension.stop_signal > 0
             if not present.inadmissible:
                 self.convergence.set_max_chain_extension(extension.max_chain_extension)
-                present.safe_change = equilibrium.safe_change(NEAR_LIMIT) if self._bounded else 0.0
+                present.safe_change = (
+                    equilibrium.safe_change(NEAR_LIMIT) if self._uses_safe_change else 0.0
+                )
         if present.inadmissible:
             residual.set(np.nan)
             return
@@ -446,7 +455,8 @@ class GuardedNewton:
         if present.first_iterate is None:
             first = x.array_r - step.array_r
             present.first_iterate = self._length(first - present.step_start[: first.size])
-        # This bounds |dF|. No evaluation is needed if all states within the bound are admissible.
+        # The largest gradient times the largest nodal step bounds |dF|. No evaluation is needed if
+        # all states within the bound are admissible.
         largest = np.sqrt(3) * step.norm(PETSc.NormType.NORM_INFINITY)
         present.safe_change -= self.equilibrium.quadrature.largest_gradient * largest
         present.is_certain = present.safe_change > 0.0
@@ -466,6 +476,7 @@ class GuardedNewton:
                 "line search failed: no step with r < L and J > 0 after %d halvings",
                 LINE_SEARCH_HALVINGS,
             )
+        present.short_steps = present.short_steps + 1 if halving >= SHORT_STEP_HALVINGS else 0
         if halving:
             log.debug("Newton step shortened to 1/%d to keep r < L and J > 0", 2**halving)
         return improved or halving > 0
@@ -492,6 +503,8 @@ class GuardedNewton:
         present.previous, present.norm = present.norm if iteration else np.inf, norm
         if self.convergence.reached(norm, present.previous):
             return PETSc.SNES.ConvergedReason.CONVERGED_FNORM_ABS
+        if present.short_steps >= SHORT_STEPS:
+            return PETSc.SNES.ConvergedReason.DIVERGED_LOCAL_MIN
         if iteration >= snes.getTolerances()[3] or self._linear.given_up:
             return PETSc.SNES.ConvergedReason.DIVERGED_MAX_IT
         return PETSc.SNES.ConvergedReason.ITERATING

@@ -277,7 +277,7 @@ def _measured(table: MeasuredTable, place: str, folder: Path, scene: Scene) -> M
             rule = (
                 "is prescribed, not measured"
                 if name in table.sd
-                else "each measured column has a standard deviation"
+                else "missing: each measured column needs a standard deviation"
             )
             raise SceneError(f"{place}.sd.{name}: {rule}")
     return Measured(

@@ -15,6 +15,7 @@ import pytest
 from remodel_fenicsx import Recording, Scene, SceneError, cli, preset_scene, read_scene
 from remodel_fenicsx.extend import MATRICES, REMODELS, SHAPES
 from remodel_fenicsx.parts import Tube
+from remodel_fenicsx.system import environment
 from tests.runs import last_row, rows_of, simulated
 
 FOLDER = Path(__file__).parents[2] / "demos" / "extensions"
@@ -97,21 +98,11 @@ def test_fibres_that_stay_bear_a_tube_as_pymecht_says(tmp_path: Path) -> None:
     """pymecht 1.1.3, `goh` and `nh`, a tube of 1 to 1.3 that is 10 % longer; two layers of one tissue are none."""
     script, demo = FOLDER / "gasser_ogden_holzapfel.py", FOLDER.parent / "artery.toml"
     layers = {"regions": {"media": {"outer_radius": 1.1}, "adventitia": {}}}
-    with patch.dict(MATRICES):
+    with patch.dict(MATRICES), patch.dict(environment._loaded):
         for name, regions in (("one", {}), ("layers", layers)):
             words = [*(f"{key}={toml(value)}" for key, value in (FIBRES | regions).items()), *LOADS]
             asked = [part for word in words for part in ("--set", word)]
-            line = [
-                "run",
-                str(demo),
-                "--with",
-                str(script),
-                *asked,
-                "-q",
-                "--no-report",
-                "-o",
-                str(tmp_path / name),
-            ]
+            line = f"run {demo} --with {script} -q --no-report -o {tmp_path / name}".split() + asked
             assert cli.main(line) == 0
             radii = Recording(tmp_path / name).history["inner_radius"]
             np.testing.assert_allclose(radii[1:], [1.23184606, 1.42517281, 1.52797886], rtol=1e-5)
@@ -149,6 +140,7 @@ def test_lost_collagen_is_a_network_of_that_density(scene: Any) -> None:
         cube.with_values({"remodeling.decay.rate": -1.0})
 
 
+@pytest.mark.usefixtures("scene")
 def test_a_steady_state_that_there_is_not_is_told(caplog: pytest.LogCaptureFixture) -> None:
     """What is lost at a constant rate never rests: the path ends with a warning, at its beginning."""
     runpy.run_path(str(FOLDER / "decaying_collagen.py"))

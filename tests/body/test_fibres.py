@@ -20,7 +20,7 @@ from remodel_fenicsx.model.axes import cells_from_tensors, structure_tensors
 from remodel_fenicsx.running import resume
 from tests.conftest import Cases
 from tests.results.test_export import TUBE
-from tests.runs import SELF, made
+from tests.runs import SELF, last_row, made
 from tests.tables import rows, unescaped
 
 R0 = 0.9
@@ -324,6 +324,13 @@ def test_one_and_two_ranks_have_the_same(cases: Cases) -> None:
         "fibre_angle_outer",
     ):
         np.testing.assert_allclose(two[name], one[name], rtol=0, atol=1e-9, err_msg=name)
+
+
+def test_angles_of_a_sheet_are_measured_from_x() -> None:
+    of: dict[str, Any] = {"geometry": {"shape": "sheet"}, "remodeling": {"law": "none"}}
+    file = Path(__file__).parent / "files" / "sheet.csv"
+    row = last_row(Scene(**of, cells={"fibres": str(file)}, time={"end": 1.0, "step": 1.0}))
+    assert row["fibre_angle"] == pytest.approx(30.0)
 
 
 def test_a_region_has_a_file_of_its_own(tmp_path: Path) -> None:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import runpy
+import tomllib
 from functools import partial
 from pathlib import Path
 from types import SimpleNamespace
@@ -14,7 +16,7 @@ from scipy.spatial.transform import Rotation
 
 from remodel_fenicsx import Recording, Scene, preset_scene, read_scene
 from remodel_fenicsx.body.tube import whole_tube
-from remodel_fenicsx.extend import DRIVERS, Driver
+from remodel_fenicsx.extend import DRIVERS, MATRICES, Driver
 from remodel_fenicsx.model.cells import structure_tensor
 from remodel_fenicsx.model.residual_stress import fresh_stretches
 from remodel_fenicsx.results.columns import Measurement
@@ -23,26 +25,31 @@ from remodel_fenicsx.running import run
 from remodel_fenicsx.scene import scene_from_dict
 from tests.conftest import Cases, slowly
 from tests.mesh_files import TUBE, write_tube
-from tests.reference.elastin import ElasticWall, fresh, outwards
+from tests.reference.elastin import ElasticWall, fresh, outwards, pulled
 from tests.reference.radial import RadialMaterial, secant_stiffness
 from tests.results.test_export_again import again, grown, scene as growing
-from tests.runs import SELF, goes_on, last_row, opening_angle, rows_of, simulated, taylor_orders
+from tests.runs import (
+    SELF,
+    goes_on,
+    last_row,
+    made,
+    opening_angle,
+    rows_of,
+    simulated,
+    taylor_orders,
+)
 from tests.tables import rows, values
 from tests.values import ANGLES, isotropic, ramped
 
-STIFF = RadialMaterial(lame_mu=7.0, lame_lambda=61.6)
 RADII = ["inner_radius", "outer_radius"]
 GROWN = ["content", "natural_length", "growth"]
 HOOP, AXIAL = (
     [f"{name}_stress{part}" for part in ("_matrix", "_collagen")] for name in ("hoop", "axial")
 )
 
-EARLY = {
-    **{f"loads.{name}.ramp": [[0.0, 0.0], [8.0, 1.0]] for name in ("pressure", "elongation")},
-    "time.end": 40.0,
-    "time.step": 4.0,
-    "remodeling.turnover.time": 10.0,
-}
+numbers = partial(np.fromstring, sep=" ")
+COMMON = tomllib.loads(Path(__file__).with_name("elastin_tables.toml").read_text())
+EARLY = COMMON["early"]
 
 
 def passive(
@@ -55,15 +62,11 @@ def passive(
 ) -> Scene:
     """The default tissue, which does not remodel."""
     of: dict[str, Any] = {
-        "geometry": {"shape": "tube", "inner_radius": 1.0, "outer_radius": 1.3, "length": 1.0},
-        "mesh": {"refinement": 2, "degree": 2},
         "output": {"fields": False, "report": False, "columns": list(columns)},
         "material": {"elastin": {"prestretch": prestretch}},
         "loads": ramped(24.0, pressure=pressure, elongation=elongation),
-        "remodeling": {"law": "none"},
-        "time": {"end": 24.0, "step": 4.0},
     }
-    return scene_from_dict(isotropic("consistent", kinematics, **of | tables))
+    return scene_from_dict(isotropic("consistent", kinematics, **COMMON["passive"] | of | tables))
 
 
 def vessel(columns: Any, **changes: Any) -> Scene:
@@ -89,7 +92,7 @@ def held(simulation: Any, pressure: float, elongation: float) -> dict[str, float
     """Radii and forces under other loads, that nothing has had time to follow."""
     loads = {"pressure": pressure, "elongation": elongation}
     simulation.stepper.coupling.solve_equilibrium(simulation.state.time + 1e-9, loads)
-    return seen(simulation, [*RADII, "axial_force", "reduced_axial_force"])
+    return seen(simulation, [*WALL, "reduced_axial_force"])
 
 
 def without_loads(simulation: Any) -> tuple[float, float, float]:
@@ -101,39 +104,59 @@ def without_loads(simulation: Any) -> tuple[float, float, float]:
 
 
 # ---------------------------------------------------------------- fresh tissue
-@pytest.mark.parametrize(
-    ("of", "prestretch", "expected"),
-    [
-        (RadialMaterial(), (1.2, 1.5), (0.904205, 0.755517, 1.43663)),
-        (STIFF, (0.92, 1.36), (1.078120, 0.765781, 1.207839)),
-        (STIFF, (0.92, 1.6), (1.086226, 0.667959, 1.367824)),
-    ],
-)
-def test_stretches_of_fresh_tissue(of: RadialMaterial, prestretch: Any, expected: Any) -> None:
+def free_of_stress(simulation: Any) -> None:
+    """In its place."""
+    present = measured(simulation)
+    assert np.abs(present.stress).max() < 1e-9 > np.abs(present.F - np.eye(3)).max()
+
+
+@pytest.mark.parametrize(("of", "prestretch", "expected"), COMMON["fresh"])
+def test_stretches_of_fresh_tissue(of: Any, prestretch: Any, expected: Any) -> None:
     """At a point, by two other programs."""
-    material = {"lame_mu": of.lame_mu, "lame_lambda": of.lame_lambda}
-    scene = passive([], material=material | {"elastin": {"prestretch": prestretch}})
+    scene = passive([], material=of | {"elastin": {"prestretch": prestretch}})
     found = fresh_stretches(scene.properties()[""].tissue)
     assert found == pytest.approx(expected, abs=1e-5)
-    assert found == pytest.approx(fresh(of, prestretch), abs=1e-9)
+    assert found == pytest.approx(fresh(RadialMaterial(**of), prestretch), abs=1e-9)
 
 
 def test_fresh_tissue_is_free_of_stress_at_every_point() -> None:
     """So that the mesh is the unloaded body, and a cut opens nothing."""
-    names = [*RADII, "axial_force", "opening_angle", *ALONG[:2]]
+    names = [*WALL, "opening_angle", *ALONG[:2]]
     elastin = fresh(RadialMaterial(), (1.2, 1.5))[:2] * (1.2, 1.5)
     scene = passive(names, (1.2, 1.5), 0.0, 0.0, time={"end": 1.0})
     with simulated(scene) as (simulation, of_run):
-        stress = measured(simulation).stress
-    assert np.abs(stress).max() < 1e-9
+        free_of_stress(simulation)
     assert [of_run[-1][name] for name in names] == pytest.approx([1, 1.3, 0, 0, *elastin], abs=1e-9)
 
 
+# ---------------------------------------------------------------- blocks and tendons
+@pytest.mark.parametrize(("changes", "axes", "nominal"), COMMON["blocks"])
+def test_blocks_are_stretched_as_by_hand(changes: Any, axes: Any, nominal: Any) -> None:
+    """And are free of stress, in their place, once they are let go."""
+    expected = pulled(RadialMaterial(), (1.2, 1.5), np.array(nominal))
+    with simulated(scene_from_dict(COMMON["block"]).with_values(changes)) as (simulation, _):
+        assert np.abs(measured(simulation).F[..., axes, axes] - expected).max() < 1e-8
+        loads = dict.fromkeys(simulation.scene.loads, 0.0)
+        simulation.stepper.coupling.solve_equilibrium(4.1, loads)
+        free_of_stress(simulation)
+
+
+def test_a_sheet_with_its_axes_swapped_is_the_other_one() -> None:
+    """Numbers, forces, and directions of the matrix."""
+    found = []
+    with patch.dict(MATRICES):
+        runpy.run_path(str(Path(__file__).parents[2] / "demos/extensions/second_network.py"))
+        for changes in COMMON["swapped"]:
+            with made(scene_from_dict(COMMON["block"]).with_values(changes)) as simulation:
+                free_of_stress(simulation)
+                *_, step = simulation.steps()
+            found.append([step.row["elongation_x"], step.row["elongation_y"]])
+    assert found[0] == pytest.approx(found[1][::-1], rel=1e-8)
+    assert np.ptp(found[0]) > 0.01
+
+
 # ---------------------------------------------------------------- tubes that do not remodel
-@pytest.mark.parametrize(
-    ("prestretch", "elongation", "expected"),
-    [((1.2, 1.5), 0.1, (2.15685, 2.31100, 8.10436)), ((1.0, 1.5), 0.3, (2.0595, 2.19621, 12.0061))],
-)
+@pytest.mark.parametrize(("prestretch", "elongation", "expected"), COMMON["tubes"])
 def test_passive_tubes_are_those_of_other_programs(
     prestretch: Any, elongation: float, expected: Any
 ) -> None:
@@ -156,36 +179,28 @@ def balanced(layers: Any, row: dict[str, float], axial: float = 1.1) -> None:
 def test_a_prestretch_of_one_changes_no_digit() -> None:
     """Also not of a wall that remodels."""
     names = [*RADII, *ANGLES, "content", *HOOP]
-    key, material = "material.elastin.prestretch", {"lame_mu": 7.0, "lame_lambda": 61.6}
-    plain, without = (
-        vessel(names, **EARLY | change) for change in ({key: (1.0, 1.0)}, {"material": material})
-    )
+    plain, without = (vessel(names, **EARLY | change) for change in COMMON["plain"])
     assert plain.is_stress_free and not plain.material.has_elastin
     for one, other in zip(*map(rows_of, (plain, without)), strict=True):
         assert one | {"seconds": 0.0} == other | {"seconds": 0.0}
 
 
-@pytest.mark.parametrize(
-    ("inner", "outer"), [((1.0, 1.0), (1.2, 1.5)), ((0.9, 1.4), (1.1, 1.2)), ((1.2, 1.5),) * 2]
-)
-def test_layers_differ(inner: Any, outer: Any) -> None:
+@pytest.mark.parametrize("regions", COMMON["layers"])
+def test_layers_differ(regions: Any) -> None:
     """Without elastin inside, and with the same."""
-    regions = {
-        "media": {"outer_radius": 1.1, "material": {"elastin": {"prestretch": inner}}},
-        "adventitia": {"material": {"elastin": {"prestretch": outer}}},
-    }
     row = last_row(passive(WALL, (1.0, 1.0), regions=regions))
+    inner, outer = (one["material"]["elastin"]["prestretch"] for one in regions.values())
     tissue = RadialMaterial()
     balanced([(1.0, 1.1, tissue, inner), (1.1, 1.3, tissue, outer)], row)
 
 
-SHORT: Any = {"loads": ramped(2.0, pressure=0.4, elongation=0.1), "time": {"end": 2.0}}
+SHORT = COMMON["short"]
 ALONG = ["elastin_stretch_circumferential", "elastin_stretch_axial", *HOOP, *AXIAL]
 
 
 def test_a_whole_tube_is_the_one_on_a_radius() -> None:
     """Its elastin lies along the local axes; parts of the stress, and what a cut would show."""
-    names = [*RADII, "axial_force", *ALONG, "opening_angle", "axial_stretch_in_vivo"]
+    names = [*WALL, *ALONG, "opening_angle", "axial_stretch_in_vivo"]
     scene = passive(names, (1.2, 1.5), kinematics="full", **SHORT)
     whole = last_row(scene, whole_tube(scene.geometry, (16, 4, 1), "hexahedron", 2, SELF))
     radial = last_row(passive(names, (1.2, 1.5), **SHORT))
@@ -198,13 +213,9 @@ def own_values(file: Path, **tables: Any) -> dict[str, Any]:
     """A tube from a file."""
     of: dict[str, Any] = {
         "geometry": {"shape": "mesh", "file": str(file)},
-        "cells": {"initial": "isotropic"},
-        "material": {"repulsion": "log", "elastin": {"prestretch": [1.2, 1.5]}},
         "output": {"fields": False, "report": False, "columns": ["lumen_volume", *ALONG]},
-        "solver": {"method": "direct"},
-        "remodeling": {"law": "none"},
     }
-    return of | SHORT | tables
+    return COMMON["own"] | of | SHORT | tables
 
 
 def own(file: Path, **tables: Any) -> Scene:
@@ -214,23 +225,20 @@ def own(file: Path, **tables: Any) -> Scene:
 
 def test_an_own_mesh_of_the_tube_is_the_tube(tmp_path: Path) -> None:
     """With directions that are found in it; nothing moves without loads."""
-    file = write_tube(tmp_path / "tube.msh", counts=(24, 4, 1))
-    loads = {"loads": ramped(2.0, pressure=1.5, elongation=0.1)}
-    alone, row = last_row(own(file, loads={}, time={"end": 1.0})), last_row(own(file, **loads))
-    polygon = 3 * np.pi * np.sinc(1 / 12)
-    assert alone["lumen_volume"] == pytest.approx(polygon, rel=1e-3)
-    same: Any = {"geometry": {"shape": "tube", "inner_radius": 1, "outer_radius": 2, "length": 3}}
-    radial = last_row(passive([*RADII, *ALONG], (1.2, 1.5), **SHORT | loads, **same))
-    radius = np.sqrt(row["lumen_volume"] / 1.1 / polygon)
-    assert radius == pytest.approx(radial["inner_radius"], rel=0.01)
-    for name in ALONG:
-        accuracy = 0.03 if "stress" in name else 0.01
-        assert row[name] == pytest.approx(radial[name], rel=accuracy, abs=0.03), name
+    file = write_tube(tmp_path / "tube.msh", counts=(24, 4, 1), degree=2)
+    pressed = COMMON["pressed"]
+    alone = last_row(own(file, **pressed | {"loads": {}}))
+    assert alone["lumen_volume"] == pytest.approx(3 * np.pi, rel=1e-4)
+    radial = last_row(passive([*RADII, *ALONG], **COMMON["same"] | pressed))
+    row = last_row(own(file, **pressed))
+    assert row["lumen_volume"] == pytest.approx(3.3 * np.pi * radial["inner_radius"] ** 2, rel=1e-3)
+    assert [row[name] for name in ALONG] == pytest.approx(
+        [radial[name] for name in ALONG], rel=1e-3
+    )
 
 
 # ---------------------------------------------------------------- walls at rest
 RESTS = rows(__file__, "elastin_rests.txt")
-numbers = partial(np.fromstring, sep=" ")
 MEANS = ["wall_thickness", "mean_hoop_stress", "reduced_axial_force", *GROWN]
 
 
@@ -246,7 +254,7 @@ def test_walls_rest_where_an_independent_program_says(
     turnover = scene.remodeling.turnover
     changing = {"growth": turnover.grows} | dict.fromkeys(GROWN[:2], turnover.is_on)
     columns = [name for name in MEANS if changing.get(name, True)]
-    columns += ["inner_radius", "outer_radius", "axial_force", *ANGLES]
+    columns += [*WALL, *ANGLES]
     with simulated(scene.with_values({"output.columns": columns})) as (simulation, of_run):
         row = of_run[-1]
         assert opening_angle(simulation) == pytest.approx(float(cut), abs=2.0)
@@ -278,14 +286,10 @@ def identities_at_rest(simulation: Any) -> None:
 
 def test_a_wall_on_its_way_is_that_of_the_reference() -> None:
     """Fine steps, and what a cut opens."""
-    reference = ElasticWall(
-        STIFF, (1.0, 1.3), 0.0, 0.025, 10.0, 1.11, 2.4, 0.42,
-        prestretch=(0.92, 1.36), exponent=8.0,
-    )  # fmt: skip
+    reference = ElasticWall(RadialMaterial(lame_mu=7.0, lame_lambda=61.6), **COMMON["reference"])
     reference.run(1.3, 0.32, 8.0, 20.0, 0.5)
     expected = reference.row()
-    fine = {"time.end": 20.0, "time.step": 0.5, "mesh.refinement": 6}
-    scene = vessel(expected, **EARLY | fine)
+    scene = vessel(expected, **EARLY | COMMON["fine"])
     with simulated(scene) as (simulation, of_run):
         assert opening_angle(simulation) == pytest.approx(reference.cut(), abs=0.5)
     for name, value in expected.items():
@@ -335,8 +339,7 @@ def test_a_driver_may_take_the_stress_of_collagen_alone() -> None:
     """By hand; it has no elastin in it, and the columns of both parts are the whole stress."""
     mine = Driver(lambda F, stresses: stresses.collagen.cauchy, False)  # type: ignore[union-attr]
     with patch.dict(DRIVERS, mine=mine):
-        mine_alone = {"remodeling.driver": "mine", "remodeling.exponent": 2.0}
-        scene = vessel(HOOP, **EARLY | mine_alone)
+        scene = vessel(HOOP, **EARLY | COMMON["mine"])
         with simulated(scene) as (simulation, _):
             remodeling = simulation.stepper.remodeling
             collagen, expected = remodeling.driving_tensor()[1], network_by_hand(simulation)
@@ -365,23 +368,16 @@ def test_a_run_goes_on(tmp_path: Path) -> None:
     assert "prestretch = [0.92, 1.36]" in (found.path / "scene.toml").read_text()
 
 
-KEPT = ("lumen_volume", "fibre_angle_inner", "content", "growth", "elastin_stretch_axial")
-
-
 def test_what_export_writes_begins_the_same_run(tmp_path: Path) -> None:
     """With the natural state that made fresh tissue stress-free; of tetrahedra, one F each."""
     mesh = write_tube(tmp_path / "tube.msh", "tetrahedron")
-    tables: Any = {
-        "material": {"repulsion": "log", "elastin": {"prestretch": [0.92, 1.36]}},
-        "output": {"columns": [*KEPT], "report": False},
-        "remodeling": grown(),
-    }
+    tables = COMMON["exported"] | {"remodeling": grown()}
     started = run(growing(mesh, 3.0, natural={}, **tables), tmp_path / "run", SELF)
     file = export(started, "vtu", tmp_path / "first.vtu", 2.0)
     second = run(again(mesh, file, 2.0, **tables), tmp_path / "second", SELF)
     original, read = (Recording(folder).history for folder in (started, second))
     assert abs(original["growth"][2] - 1.0) > 1e-3
-    for name in KEPT:
+    for name in tables["output"]["columns"]:
         np.testing.assert_allclose(read[name][1:3], original[name][2:4], rtol=2e-3, err_msg=name)
 
 
@@ -397,7 +393,6 @@ def test_two_ranks_find_the_same(cases: Cases) -> None:
 
 def test_a_wall_without_chains_has_stress_in_the_matrix_alone() -> None:
     """Both parts are columns there too."""
-    isotropic = {"cells.initial": "isotropic", "model.kinematics": "radial", "time.end": 1.0}
-    no_chains = {"material.chain_density": 0.0, "remodeling.law": "none", "output.columns": HOOP}
-    row = last_row(preset_scene("consistent", "tube").with_values(isotropic | no_chains))
+    changes = COMMON["alone"] | {"output.columns": HOOP}
+    row = last_row(preset_scene("consistent", "tube").with_values(changes))
     assert row[HOOP[0]] > 0 == row[HOOP[1]]

@@ -38,6 +38,16 @@ def fresh(of: RadialMaterial, prestretch: Prestretch) -> Array:
     return np.exp(solved(lambda x: principal(np.exp(x), of, prestretch), np.zeros(3)))
 
 
+def pulled(of: RadialMaterial, prestretch: Prestretch, nominal: Array) -> Array:
+    """Stretches of a homogeneous body under nominal stresses along its axes, (3,) each."""
+    g = fresh(of, prestretch)
+
+    def left(x: Array) -> Array:
+        return principal(np.exp(x) * g, of, prestretch) - nominal * np.exp(x - x.sum())
+
+    return np.exp(solved(left, np.zeros(3)))
+
+
 def outwards(layers: Sequence[Layer], inner: float, pressure: float, axial: float) -> Array:
     """Outer radius, radial stress left there, and axial force of a tube with this inner radius.
 

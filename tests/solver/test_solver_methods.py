@@ -260,22 +260,45 @@ def test_an_indefinite_tangent_is_solved_by_every_method(caplog: pytest.LogCaptu
     assert "Cholesky factorisation" in said["lagged"]
 
 
-def test_levels_that_have_become_useless_are_made_anew(caplog: pytest.LogCaptureFixture) -> None:
-    """Near locking levels of the unloaded body need 16 iterations, new ones 12: between them lies the limit."""
+def test_where_multigrid_fails_a_factor_is_taken(caplog: pytest.LogCaptureFixture) -> None:
+    """GMRES may do two iterations, which is enough with a factor alone."""
     caplog.set_level(logging.INFO)
     changes = {"time__end": 3.0, "loads__pressure__value": 30.0}
     simulation, expected = simulated("direct", **changes)
     simulation.close()
-    caplog.clear()
-    options = {"snes_lag_preconditioner": 1000, "ksp_max_it": 13}
-    simulation, rows = simulated("iterative", solver__petsc_options=options, **changes)
+    simulation, rows = simulated("iterative", solver__petsc_options={"ksp_max_it": 2}, **changes)
     simulation.close()
     assert (
-        "Newton failed (the linear solver failed); "
-        "retrying with new multigrid levels in every iteration" in caplog.text
+        "Newton failed (the linear solver failed); retrying with a factorisation from now on"
+        in caplog.text
     )
-    assert "in parts" not in caplog.text
+    assert "substeps" not in caplog.text
     assert_same(rows, expected)
+
+
+@pytest.mark.parametrize(
+    ("limit", "value", "method"),
+    [
+        ("CHEAP_FACTOR", 10_000, "lagged"),
+        ("CHEAP_FACTOR", 10, "iterative"),
+        ("FACTOR_BYTES", 1e12, "iterative"),
+    ],
+)
+def test_auto_takes_a_factor_where_it_is_cheap(
+    limit: str,
+    value: float,
+    method: str,
+    monkeypatch: pytest.MonkeyPatch,
+    caplog: pytest.LogCaptureFixture,
+) -> None:
+    """By its operations and its memory, of bodies above a size."""
+    caplog.set_level(logging.INFO)
+    monkeypatch.setattr(methods, "MIN_MULTIGRID", 0)
+    monkeypatch.setattr(linear, limit, value)
+    simulation, _ = simulated("auto")
+    simulation.close()
+    assert simulation.stepper.coupling.newton.method == method
+    assert f"solver.method 'auto' takes {method!r}: a factorisation needs" in caplog.text
 
 
 @pytest.mark.parametrize(
@@ -284,7 +307,7 @@ def test_levels_that_have_become_useless_are_made_anew(caplog: pytest.LogCapture
 def test_degree_one_is_the_next_level_of_degree_two(
     bulk: float, options: dict[str, Any], caplog: pytest.LogCaptureFixture
 ) -> None:
-    """Where options of one's own say nothing else, until a stiff bulk is too much for it."""
+    """Where options of one's own say nothing else."""
     caplog.set_level(logging.INFO)
     rows, scene = {}, preset_scene("kuhl-holzapfel-2007", "tube")
     values = {
@@ -303,9 +326,7 @@ def test_degree_one_is_the_next_level_of_degree_two(
             rows[method] = [step.row for step in simulation.steps()]
             kind = simulation.stepper.coupling.newton._snes.getKSP().getPC().getType()
     assert_same(rows["iterative"], rows["direct"])
-    stiff = bulk > 100
-    assert kind == ("gamg" if options or stiff else "mg")
-    assert ("retrying with multigrid levels of the matrix from now on" in caplog.text) == stiff
+    assert kind == ("gamg" if options else "mg") and "retrying" not in caplog.text
 
 
 # ---------------------------------------------------------------- quasi-Newton steps

@@ -15,7 +15,7 @@ def test_the_page_is_what_its_tables_say() -> None:
 
 
 def test_what_must_agree_agrees() -> None:
-    """In the kept table; tests of peers, sheets and set points run such cases again."""
+    """In the kept table; tests of peers, sheets, exponents and thresholds run such cases again."""
     rows = rows_of(DOCS / "figures" / "validation-agreed.csv")
     assert len(rows) > 30 and all(row["difference"] <= row["tolerance"] for row in rows)
 
