@@ -241,7 +241,7 @@ class GuardedNewton:
         self.method = method = resolve_auto(
             settings.method, unknowns, is_reduced, kinematics.suits_multigrid
         )
-        if method != settings.method and method == "iterative":
+        if settings.method == AUTO and method == "iterative":
             self.method = method = cheaper_method(self._matrix)
         # In three dimensions PETSc's LU replaces MUMPS only with 'auto', so that the results of a
         # named method do not depend on the size.
