@@ -206,7 +206,7 @@ def _solver(scene: Scene) -> Solver:
 
 def _remodeling(scene: Scene, comm: MPI.Intracomm) -> Remodeling:
     """Return the remodeling settings; the path to a steady state with random cells is relaxed."""
-    # When the principal values of random cells change their rank, the cells jump at any step size,
+    # When the order of the driver's principal values changes, random cells jump at any step size,
     # and the passes oscillate.
     if not (scene.time.is_equilibrium and scene.has_random_cells and scene.has_order_jumps):
         return scene.remodeling

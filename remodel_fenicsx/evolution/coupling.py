@@ -91,8 +91,8 @@ class Predictor:
     def solved(self, step: LoadStep, before: Array, again: bool = False) -> None:
         """Record the rate of a solved step.
 
-        `before` holds the unknowns before the step. With `again` it holds those after the step's
-        first solve, and the rate is added to the recorded one.
+        `before` holds the unknowns before the step; in a second solve (`again`) those after the
+        first, and both rates are added.
         """
         unknown = self.state.unknown
         speed = np.asarray((unknown.x.array - before) / step.duration, dtype=np.float64)
@@ -132,8 +132,8 @@ class Traits(NamedTuple):
     order
         Order of the error in the step size.
     accumulates
-        Whether the errors of steps accumulate. Otherwise the error of a row is that its cells are
-        those of the step before.
+        Whether the errors of steps accumulate. Otherwise only the cells have an error: they are
+        one step old.
     max_scaled_step
         Largest adaptive step times kappa; an explicit rule oscillates with larger steps.
 

@@ -357,7 +357,7 @@ class RemodelingPass(Remodels):
         return self.size(self._change_by_a_pass(time, residual))
 
     def change_to_limit(self, time: float, duration: float, residual: float) -> Array:
-        """Return the change of A by a pass up to a time, zero at points without tension."""
+        """Return the change of A by a pass to a late time, zero at points without tension."""
         change = self._change_by_a_pass(time, residual)
         change[self.without_tension(residual).reshape(self.quadrature.shape)] = 0.0
         return change

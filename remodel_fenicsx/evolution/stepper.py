@@ -44,7 +44,7 @@ CHECK_INTERVAL = (
 @with_old_names
 @dataclass
 class Step:
-    """Record of a time step, which is filled from the solution to the end of the step.
+    """Record of a time step, filled between the solution and the end of the step.
 
     Attributes
     ----------
@@ -277,7 +277,7 @@ class WarnsOnce(Watcher):
 
 
 class LoadCaseSolver:
-    """State with its solver; a stepper, or a further load case that has the same cells.
+    """A state and its solver: the stepper, or a further load case with the same cells.
 
     Attributes
     ----------
@@ -353,7 +353,7 @@ class Stepper(LoadCaseSolver):
         self.tissue = state.parameters(tissue).tissue
         self.remodeling = RemodelingPass(state, self.tissue, remodeling, kappa, processes)
         self.each_case = [self]
-        # Cells that never change need no coupling.
+        # For cells that never change the cheapest coupling is enough.
         name = remodeling.coupling if self.remodeling.law.remodels else "staggered"
         if processes and name != remodeling.coupling and state.comm.rank == 0:
             log.warning(

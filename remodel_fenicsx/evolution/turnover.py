@@ -74,7 +74,7 @@ class Growth:
         return np.asarray(self.settings.volume * content / (self._reference * self.ratio))
 
     def set_initial(self, content: Array, ratio: Array) -> None:
-        """Set J_g of an earlier run, and the m_ref with which the content gives this J_g."""
+        """Set J_g of an earlier run, and the reference content m_ref that gives this J_g."""
         volume = self.settings.volume
         self._reference[:] = content * volume / (ratio - 1.0 + volume)
         self.set(ratio)
@@ -161,7 +161,7 @@ class TurnoverPass(Remodels):
         )
         self.slowest, self.fastest = 1.0 / settings.time, max(1.0, settings.gain) / settings.time
         self.growth = Growth(state, settings) if state.kinematics.grows else None
-        # Values of ln m and ln rho, outside the transaction because `before` derives them anew:
+        # Values of ln m and ln rho. A failed step need not restore them: `before` computes them.
         # `_step_start`: at the start of the step
         # `_last_solved`: in the last solved state
         # `_present`: in the equilibrium of this step, and in its row
@@ -251,7 +251,7 @@ class TurnoverPass(Remodels):
         return changed(values, self.rates(present=True), time - self.state.time)
 
     def distance_between(self, values: Array, other: Array) -> float:
-        """Return the largest relative difference of m or rho, as radians converted to degrees."""
+        """Return the largest relative difference of m or rho times 180/pi, for time.tolerance."""
         return float(np.degrees(self.size((other - values).T.reshape(*self.quadrature.shape, 2))))
 
     def remaining_change(self, time: float, residual: float) -> float:

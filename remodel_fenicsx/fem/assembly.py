@@ -48,21 +48,21 @@ def rigid_body_modes(space: FunctionSpace, matrix: PETSc.Mat) -> PETSc.NullSpace
     return motions
 
 
-def degree_one(space: FunctionSpace) -> tuple[FunctionSpace, PETSc.Mat]:
-    """Return the space of degree 1, and the matrix that interpolates from it. Collective."""
+def prolongation_from_degree_one(space: FunctionSpace) -> PETSc.Mat:
+    """Return the matrix that interpolates from degree 1 to the space. Collective."""
     below = lagrange(space.mesh, 1, tuple(space.value_shape)).function_space
     prolongation = dolfinx.fem.petsc.interpolation_matrix(below, space)
     prolongation.assemble()
-    return below, prolongation
+    return prolongation
 
 
 class PMultigrid:
-    """Multigrid for elements of degree 2, with `degree_one` as the lower level. Collective."""
+    """Multigrid for elements of degree 2, with degree 1 as the lower level. Collective."""
 
     # A factor of the lower level is cheap: it has an eighth of the unknowns.
 
-    def __init__(self, pc: PETSc.PC, below: tuple[FunctionSpace, PETSc.Mat], matrix: PETSc.Mat):
-        _, self._prolongation = below
+    def __init__(self, pc: PETSc.PC, prolongation: PETSc.Mat, matrix: PETSc.Mat):
+        self._prolongation = prolongation
         self._coarse = matrix.PtAP(self._prolongation)
         self._options = ProblemOptions(levels_options(matrix.comm.size), {})
         pc.setType("mg")
@@ -93,9 +93,9 @@ class SpdSolver:
         self._matrix = create_matrix(self._form)
 
     @cached_property
-    def _degree_one(self) -> tuple[FunctionSpace, PETSc.Mat]:
-        """Space of degree 1 and its interpolation, for all solves. Collective on first access."""
-        return degree_one(self.space)
+    def _prolongation(self) -> PETSc.Mat:
+        """Interpolation from degree 1, for all solves. Collective on first access."""
+        return prolongation_from_degree_one(self.space)
 
     def solve(
         self,
@@ -125,7 +125,7 @@ class SpdSolver:
         solver.getPC().setType("gamg" if multigrid else "jacobi")
         levels = None
         if multigrid and self.space.ufl_element().degree > 1:
-            levels = PMultigrid(solver.getPC(), self._degree_one, matrix)
+            levels = PMultigrid(solver.getPC(), self._prolongation, matrix)
         solver.setInitialGuessNonzero(True)
         solver.setTolerances(rtol=TOLERANCE, max_it=ITERATION_LIMIT)
         solver.solve(load, answer)

@@ -67,12 +67,14 @@ MUMPS_LU = {
     "pc_type": "lu",
     "pc_factor_mat_solver_type": "mumps",
 }
-GATHERED_MUMPS_LU = {
-    "pc_type": "telescope",
-    "telescope_ksp_type": "preonly",
-    "telescope_pc_type": "lu",
-    "telescope_pc_factor_mat_solver_type": "mumps",
-}
+
+
+def gathered(factor: Mapping[str, object]) -> dict[str, object]:
+    """Return the PETSc options of a factorisation by the first of several ranks."""
+    options = {f"telescope_{name}": value for name, value in factor.items()}
+    return {"pc_type": "telescope", "telescope_ksp_type": "preonly", **options}
+
+
 SOLVER_METHODS = {
     # MUMPS is robust for indefinite tangents too, and analyses the pattern once for all steps. On
     # several ranks it sums in the order in which messages arrive, so that its last digits differ
@@ -81,7 +83,7 @@ SOLVER_METHODS = {
     "direct": SolverMethod(
         NEWTON | {"ksp_type": "preonly", **MUMPS_LU},
         "Newton's method; MUMPS factorises each system, and runs repeat to the last digit",
-        on_several_ranks=GATHERED_MUMPS_LU,
+        on_several_ranks=gathered(MUMPS_LU),
     ),
     LAGGED: SolverMethod(
         NEWTON | {"ksp_type": "preonly"},
@@ -172,8 +174,7 @@ def levels_options(ranks: int) -> dict[str, object]:
     # Jacobi instead of SOR four times as many.
     factor = factor_options(SYMMETRIC)
     if ranks > 1:
-        factor = {f"telescope_{name}": value for name, value in factor.items()}
-        factor |= {"pc_type": "telescope", "pc_telescope_reduction_factor": ranks}
+        factor = gathered(factor) | {"pc_telescope_reduction_factor": ranks}
     return {
         "mg_levels_ksp_type": "chebyshev",
         "mg_levels_ksp_max_it": 1,

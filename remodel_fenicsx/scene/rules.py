@@ -251,7 +251,7 @@ def natural_state(scene: Scene) -> Faults:
                 )
             )
     if natural.fibres:  # the file has cells and G; a prestretch of elastin still needs axes
-        del needs[able is WithAxes :]
+        needs = needs[:1] if able is WithAxes else []
     for other, has, possible in needs:
         if not has:
             yield f"must be {none} unless {other} is {possible}", key, value

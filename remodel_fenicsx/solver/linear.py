@@ -15,7 +15,12 @@ from numpy.typing import NDArray
 from petsc4py import PETSc
 
 from remodel_fenicsx._renamed import with_old_names
-from remodel_fenicsx.fem.assembly import PMultigrid, degree_one, allreduce, rigid_body_modes
+from remodel_fenicsx.fem.assembly import (
+    PMultigrid,
+    allreduce,
+    prolongation_from_degree_one,
+    rigid_body_modes,
+)
 from remodel_fenicsx.fem.solver_methods import (
     DEFINITE,
     GENERAL,
@@ -99,7 +104,8 @@ MOST_RENEWALS = 6
 # about as much as 20 iterations.
 KEPT_LEVELS = 20
 # Operations of a factorisation per entry of the tangent up to which a few factorisations cost less
-# than multigrid: 6,200 in a branching wall of 250,000 unknowns, 10,700 in a stout one of 306,000.
+# than multigrid: 6,200 in a branching wall of 250,000 unknowns; 10,700 in a stout one of 306,000,
+# where both take about as long.
 CHEAP_FACTOR = 10_000
 FACTOR_BYTES = 13  # memory of a factorisation per entry of the factor, measured with CHOLMOD
 
@@ -366,7 +372,9 @@ class Multigrid(FullNewton):
             # The tolerance is then that of the residual itself.
             self._solver.setPCSide(PETSc.PC.Side.RIGHT)
         if space.ufl_element().degree > 1 and not any(name[:2] in ("pc", "mg") for name in given):
-            self._levels = PMultigrid(self._solver.getPC(), degree_one(space), matrix)
+            self._levels = PMultigrid(
+                self._solver.getPC(), prolongation_from_degree_one(space), matrix
+            )
         else:
             matrix.setNearNullSpace(rigid_body_modes(space, matrix))
 

@@ -36,8 +36,8 @@ Array = NDArray[np.float64]
 # The residual must not exceed a tolerance. The tolerance is at least the rounding error.
 
 FORCE_ROUNDINGS = 8.0  # accepted residual over the rounding error of assembled forces
-# Accepted residual over the force that rounded displacements cause: a strain of eps |u|/h. On thin
-# and on stiff walls 0.07 to 4 was measured.
+# Accepted residual as a multiple of the force of rounded displacements, whose strain is eps |u|/h.
+# On thin and on stiff walls 0.07 to 4 was measured.
 ROUNDED_STRAINS = 8.0
 # Largest error of a prescribed displacement, relative to the body's size. It needs a tolerance of
 # its own, because the residual is zero at constrained dofs.
@@ -49,9 +49,10 @@ PRESCRIBED_ROUNDING = 1e-13
 # quasi-Newton solver stopped too early, and some substeps were mistaken for jumps.
 INTERMEDIATE_TOLERANCE = 1e-5
 NEARLY_STRAIGHT = 0.99  # r/L above which the rounding error of one point may dominate
-COARSE = 1e-8  # tolerance over nodal forces above which that error does dominate
+COARSE = 1e-8  # tolerance / nodal forces; above this, the rounding error of one point dominates
 # Residual over the previous one above which Newton's method stagnates. Only then
-# rounding errors of displacements excuse a residual; with nearly straight chains all of them.
+# is a residual accepted because of rounding errors of displacements, and, with nearly straight
+# chains, because of any rounding errors.
 STAGNATION = 0.25
 
 
@@ -155,8 +156,8 @@ class Solution(SolverCounts):
 
     residual: float = 0.0
     extension: StateLimits = NOWHERE
-    # Distance of the solution from the step's start, over the distance of the first iterate from
-    # there; 0 for small distances.
+    # |solution - start of the step| / |first iterate - start of the step|, by which jumps are
+    # detected; 0 for small distances.
     displacement_ratio: float = 0.0
 
 
@@ -189,7 +190,7 @@ class _Solve:
     inadmissible: bool = False
     # All states whose |dF| from the last evaluated state is below this are admissible.
     safe_change: float = 0.0
-    is_certain: bool = False  # whether the state is one of them
+    is_certain: bool = False  # whether safe_change shows that the state is admissible
     short_steps: int = 0  # number of Newton steps in a row that the guards have made very short
 
 
@@ -205,7 +206,7 @@ DIVERGED_MAX_IT = -5
 
 
 def failure_text(reason: int, iterations: int, extension: StateLimits) -> str:
-    """Return why a solve has failed. If SNES has converged, its state is not admissible."""
+    """Return why a solve has failed; if SNES has converged, that its state is not admissible."""
     if reason >= 0:
         return (
             f"reached r/L = {extension.max_chain_extension:.4f}, J = {extension.min_jacobian:.4g}"
@@ -240,7 +241,7 @@ class GuardedNewton:
         self.method = method = resolve_auto(
             settings.method, unknowns, is_reduced, kinematics.suits_multigrid
         )
-        if method != settings.method and method == "iterative":
+        if settings.method == AUTO and method == "iterative":
             self.method = method = cheaper_method(self._matrix)
         # In three dimensions PETSc's LU replaces MUMPS only with 'auto', so that the results of a
         # named method do not depend on the size.
@@ -359,8 +360,8 @@ class GuardedNewton:
     def newton_correction(self, equilibrium: Equilibrium, tangents: int) -> Array:
         """Return the Newton step for `equilibrium`. Collective.
 
-        `tangents`: number of tangents assembled for this state; if 0, one is assembled, except by a
-        method that reuses factorisations.
+        `tangents`: number of tangents assembled for this state; if 0, one is assembled. A method
+        that reuses factorisations assembles one only if it has none yet.
         """
         self._to_petsc(self._x)
         equilibrium.assemble_internal(self._residual)

@@ -13,7 +13,7 @@ from petsc4py import PETSc
 from remodel_fenicsx import Simulation
 from remodel_fenicsx.fem import solver_methods as methods
 from remodel_fenicsx.scene import preset_scene
-from remodel_fenicsx.solver import linear
+from remodel_fenicsx.solver import linear, newton
 from remodel_fenicsx.solver.linear import LaggedFactorisation, Lagged, LimitedMemoryUpdate
 from remodel_fenicsx.solver.newton import GuardedNewton
 from tests import parts
@@ -299,6 +299,27 @@ def test_auto_takes_a_factor_where_it_is_cheap(
     simulation.close()
     assert simulation.stepper.coupling.newton.method == method
     assert f"solver.method 'auto' takes {method!r}: a factorisation needs" in caplog.text
+
+
+@pytest.mark.parametrize("method", ["lagged", "iterative"])
+def test_a_solve_that_the_guards_hold_up_goes_on_in_substeps(
+    method: str, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    """Here with a limit that this step reaches; it comes to the same state."""
+    caplog.set_level(logging.INFO)
+    changes = {"loads__pressure__ramp": [[0.0, 0.0], [1.0, 1.0]], "time__end": 1.0}
+    changes["loads__pressure__value"] = 12.0
+    simulation, expected = simulated(method, **changes)
+    simulation.close()
+    assert "too short" not in caplog.text
+    caplog.clear()
+    monkeypatch.setattr(newton, "SHORT_STEPS", 1)
+    monkeypatch.setattr(newton, "SHORT_STEP_HALVINGS", 1)
+    simulation, rows = simulated(method, **changes)
+    simulation.close()
+    failed = "the guards r < L and J > 0 make all Newton steps too short"
+    assert f"{failed}; solving in substeps" in caplog.text and "retrying" not in caplog.text
+    assert_same(rows, expected)
 
 
 @pytest.mark.parametrize(
