@@ -56,10 +56,13 @@ def _fields(domain: Domain, quadrature: Quadrature) -> list[Function]:
     mesh, degree = domain.mesh, quadrature.element_degree
     inner, outer, starts, ends = map(domain.facets, ROLES)
     thickness = 2 * quadrature.volume / (area(mesh, inner) + area(mesh, outer))
+    log.info("axes of the body: the radial directions")
     dx = ufl.Measure("dx", domain=mesh, metadata={"quadrature_degree": 2 * degree})
     stiffness = slopes(mesh, degree, dx)
     radial = _radial(harmonic(stiffness, inner, outer), degree, dx, thickness)
+    log.info("axes of the body: the axial directions")
     axial = _axial(radial, dx, starts, ends, thickness)
+    log.info("axes of the body: depth and station")
     trial, test = _arguments(stiffness.space)
     r, a = _unit(radial), _unit(axial)
     along_r = SpdSolver(ufl.inner(r, ufl.grad(trial)) * ufl.inner(r, ufl.grad(test)) * dx)
@@ -81,11 +84,10 @@ def slopes(mesh: Mesh, degree: int, dx: ufl.Measure) -> SpdSolver:
     return SpdSolver(ufl.inner(ufl.grad(trial), ufl.grad(test)) * dx)
 
 
-def harmonic(stiffness: SpdSolver, low: Facets, high: Facets) -> Function:
+def harmonic(stiffness: SpdSolver, low: Facets, high: Facets, multigrid: bool = False) -> Function:
     """Compute the harmonic function that is 0 on some facets and 1 on others. Collective."""
-    return stiffness.solve(
-        None, [_held(stiffness.space, low, 0.0), _held(stiffness.space, high, 1.0)]
-    )
+    held = [_held(stiffness.space, low, 0.0), _held(stiffness.space, high, 1.0)]
+    return stiffness.solve(None, held, multigrid)
 
 
 def _radial(phi: Function, degree: int, dx: ufl.Measure, thickness: float) -> Function:

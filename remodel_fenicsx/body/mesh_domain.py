@@ -78,7 +78,8 @@ class MeshDomain(Domain):
         mesh = self.mesh
         degree = int(mesh.geometry.cmap.degree)
         dx = ufl.Measure("dx", domain=mesh, metadata={"quadrature_degree": 2 * degree})
-        psi = harmonic(slopes(mesh, degree, dx), self.facets("inlet"), self.facets("outlet"))
+        ends = self.facets("inlet"), self.facets("outlet")
+        psi = harmonic(slopes(mesh, degree, dx), *ends, multigrid=degree > 1)
         slope, one = ufl.sqrt(ufl.inner(ufl.grad(psi), ufl.grad(psi))), dolfinx.fem.Constant(
             mesh, np.float64(1.0)
         )

@@ -64,12 +64,22 @@ class PointwiseRepulsion:
         ]
         self._structure: CachedValue[Array] = CachedValue(None, *of_cells)
         self._stresses, self._stiffnesses = (CachedValue[None](None, *of_stress) for _ in range(2))
+        self._stiffness_follows = False  # whether the last stress was followed by the stiffness
 
     def update(self, stiffness: bool = False) -> None:
         """Update the stress, and the stiffness on request, if unknowns or cells have changed."""
-        self._stresses(lambda: self._evaluate(stiffness=False))
+
+        def evaluate() -> None:
+            # Both take little longer than the stress alone.
+            both, self._stiffness_follows = stiffness or self._stiffness_follows, False
+            self._evaluate(both)
+            if both:
+                self._stiffnesses(lambda: None)
+
+        self._stresses(evaluate)
         if stiffness:
             self._stiffnesses(lambda: self._evaluate(stiffness=True))
+            self._stiffness_follows = True
 
     def _evaluate(self, stiffness: bool) -> None:
         derivatives = self.tissue.repulsion.derivatives
@@ -344,9 +354,9 @@ class Equilibrium:
             dolfinx.fem.petsc.apply_lifting(vector, [form], bcs=[conditions], x0=[x], alpha=-1.0)
         vector.ghostUpdate(addv=PETSc.InsertMode.ADD, mode=PETSc.ScatterMode.REVERSE)
 
-    def create_matrix(self) -> PETSc.Mat:
-        """Return an empty matrix with the pattern of the tangent. Collective."""
-        return create_matrix(self.tangent_forms[0])
+    def create_matrix(self, blocked: bool = False) -> PETSc.Mat:
+        """Return an empty matrix with the pattern of the tangent, in blocks or not. Collective."""
+        return create_matrix(self.tangent_forms[0], blocked)
 
     def assemble_tangent(self, matrix: PETSc.Mat) -> None:
         """Assemble the tangent, with unit diagonal for prescribed unknowns. Collective."""

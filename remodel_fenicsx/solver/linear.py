@@ -103,6 +103,8 @@ MOST_RENEWALS = 6
 # Iterations of a linear solve up to which the next one has the same preconditioner. New levels cost
 # about as much as 20 iterations.
 KEPT_LEVELS = 20
+# Lambda/mu above which smoothers take two steps of Chebyshev's iteration.
+STIFF_BULK = 50.0
 # Operations of a factorisation per entry of the tangent up to which a few factorisations cost less
 # than multigrid: 6,200 in a branching wall of 250,000 unknowns; 10,700 in a stout one of 306,000,
 # where both take about as long.
@@ -354,6 +356,23 @@ class FullNewton:
         """Free all objects of PETSc."""
 
 
+def takes_levels(equilibrium: Equilibrium, options: ProblemOptions) -> bool:
+    """Return whether multigrid has degree 1 as a level of its own, on a matrix in blocks."""
+    state = equilibrium.state
+    return (
+        not state.kinematics.reduced
+        and state.unknown.function_space.ufl_element().degree > 1
+        and not any(name[:2] in ("pc", "mg") for name in options.given)
+    )
+
+
+def _bulk_ratio(equilibrium: Equilibrium) -> float:
+    """Return the largest lambda/mu. Collective."""
+    parameters = equilibrium.state.parameters(equilibrium.tissue).at_points()
+    ratio = np.max(parameters.lame_lambda / parameters.lame_mu, initial=0.0)
+    return float(allreduce(equilibrium.comm, ratio, MPI.MAX))
+
+
 class Multigrid(FullNewton):
     """GMRES with multigrid, and with a factorisation once multigrid has failed."""
 
@@ -371,9 +390,12 @@ class Multigrid(FullNewton):
         if self._chooses:
             # The tolerance is then that of the residual itself.
             self._solver.setPCSide(PETSc.PC.Side.RIGHT)
-        if space.ufl_element().degree > 1 and not any(name[:2] in ("pc", "mg") for name in given):
+        if takes_levels(equilibrium, options):
             self._levels = PMultigrid(
-                self._solver.getPC(), prolongation_from_degree_one(space), matrix
+                self._solver.getPC(),
+                prolongation_from_degree_one(space),
+                matrix,
+                is_stiff=_bulk_ratio(equilibrium) > STIFF_BULK,
             )
         else:
             matrix.setNearNullSpace(rigid_body_modes(space, matrix))
@@ -387,7 +409,8 @@ class Multigrid(FullNewton):
     def renew(self) -> None:
         super().renew()
         if self._factor is not None:
-            self._factor.renew(self.matrix)
+            # Factors take no blocks.
+            self._factor.renew(self.matrix.convert(PETSc.Mat.Type.AIJ, PETSc.Mat()))
             return
         if self.tangents > 1 and self._solver.getIterationNumber() <= KEPT_LEVELS:
             return
@@ -415,8 +438,9 @@ class Multigrid(FullNewton):
         self._levels = self._factor = None
 
 
-def cheaper_method(matrix: Mat) -> str:
+def cheaper_method(equilibrium: Equilibrium) -> str:
     """Return the method for a large tangent, by the cost of factorising it. Collective."""
+    matrix = equilibrium.create_matrix()
     # One megabyte is too little for the factor, so that MUMPS ends after its analysis.
     options = ProblemOptions(factor_options(SYMMETRIC) | {"mat_mumps_icntl_23": 1}, {})
     preconditioner = PETSc.PC().create(matrix.comm)
@@ -429,6 +453,7 @@ def cheaper_method(matrix: Mat) -> str:
     options.close()
     size = FACTOR_BYTES * (entries if entries > 0 else -1e6 * entries)  # negative: millions
     nonzeros = matrix.getInfo(PETSc.Mat.InfoType.GLOBAL_SUM)["nz_used"]
+    matrix.destroy()
     memory = os.sysconf("SC_AVPHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")
     is_cheap = operations < CHEAP_FACTOR * nonzeros and size < memory
     method = LAGGED if is_cheap else "iterative"
@@ -441,7 +466,7 @@ def cheaper_method(matrix: Mat) -> str:
         size / 1e9,
         memory / 1e9,
     )
-    return str(allreduce(matrix.comm.tompi4py(), method, MPI.MAX))
+    return str(allreduce(equilibrium.comm, method, MPI.MAX))
 
 
 class Lagged(FullNewton):

@@ -24,7 +24,7 @@ from remodel_fenicsx.fem.solver_methods import (
 from remodel_fenicsx.schema.settings import Solver
 from remodel_fenicsx.solver.attempts import MADE_ANEW, attempted, say
 from remodel_fenicsx.solver.equilibrium import Equilibrium, StateLimits, PointState
-from remodel_fenicsx.solver.linear import FullNewton, cheaper_method
+from remodel_fenicsx.solver.linear import FullNewton, cheaper_method, takes_levels
 from remodel_fenicsx.state import stress_rounding
 from remodel_fenicsx.system.interrupts import Interrupted
 
@@ -227,7 +227,6 @@ class GuardedNewton:
         self._values = vector.array
         self._x = vector.petsc_vec.duplicate()
         self._residual, self._external, self._trial = (self._x.duplicate() for _ in range(3))
-        self._matrix = equilibrium.create_matrix()
         self.convergence = Convergence(equilibrium, settings)
         self._present = _Solve(self._values.copy())
         self._options_checked = False
@@ -242,11 +241,13 @@ class GuardedNewton:
             settings.method, unknowns, is_reduced, kinematics.suits_multigrid
         )
         if settings.method == AUTO and method == "iterative":
-            self.method = method = cheaper_method(self._matrix)
+            self.method = method = cheaper_method(equilibrium)
         # In three dimensions PETSc's LU replaces MUMPS only with 'auto', so that the results of a
         # named method do not depend on the size.
         small = is_small(unknowns, is_reduced) and (is_reduced or settings.method == AUTO)
         self._options = ProblemOptions(method_options(method, ranks, small), settings.petsc_options)
+        blocked = method == "iterative" and takes_levels(equilibrium, self._options)
+        self._matrix = equilibrium.create_matrix(blocked)
         self._uses_safe_change = (
             method == LAGGED
             and not self._robust
