@@ -105,7 +105,9 @@ def test_options_of_ones_own_lie_over_the_methods(direct: list[dict[str, float]]
     """A preconditioner of one's own is kept like the factors."""
     options = {"pc_type": "lu", "pc_factor_mat_solver_type": "mumps"}
     simulation, rows = simulated("lagged", solver__petsc_options=options)
-    assert simulation.stepper.coupling.newton.linear.factorisation().getFactorSolverType() == "mumps"
+    assert (
+        simulation.stepper.coupling.newton.linear.factorisation().getFactorSolverType() == "mumps"
+    )
     assert (
         simulation.stepper.coupling.newton.linear.tangents
         < sum(row["newton_iterations"] for row in rows) / 2
