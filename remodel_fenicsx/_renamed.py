@@ -51,7 +51,7 @@ OLD_NAMES: Mapping[str, Mapping[str, str]] = {
     "Scene": {
         "turned_away": "loaded_shape_warnings",
         "needs_all_points": "displacement_reason",
-        "jumps_by_rank": "has_order_jumps",
+        "jumps_by_rank": "cell_order_can_change",
         "formulation_in_words": "describe_formulation",
     },
     "Shape": {"depth_in_words": "depth_labels", "fills": "covers_body"},
@@ -61,10 +61,11 @@ OLD_NAMES: Mapping[str, Mapping[str, str]] = {
         "reach": "complete_step",
         "others": "other_cases",
     },
-    "Step": {"moment": "label"},
+    "Step": {"moment": "label", "extension": "limits"},
     "Tissue": {"relative": "normalised_length", "present_modulus": "current_modulus"},
     "Traits": {"longest": "max_scaled_step"},
     "CellField": {"ufl_cell": "symbolic_cell"},
+    "WatcherKind": {"each_case": "checks_each_case"},
     "WarnsOnce": {"of": "for_scene", "look": "check", "find": "emit", "said": "is_reported"},
     "WithParameters": {"of": "with_parameters"},
     "hold_facets": {"way": "direction"},
@@ -104,8 +105,8 @@ class OldAttribute:
         return getattr(kind if instance is None else instance, new_name(self.owner, self.old))
 
 
-def with_old_names(kind: Kind) -> Kind:
-    """Make a class accept its old names: attributes, arguments and overridden methods."""
+def with_old_names(kind: Kind, arguments: bool = True) -> Kind:
+    """Make a class accept its old names: attributes, overridden methods, and arguments."""
     owner, inherit = kind.__name__, kind.__init_subclass__
 
     def overridden(subclass: type, **keywords: object) -> None:
@@ -116,7 +117,7 @@ def with_old_names(kind: Kind) -> Kind:
     for old in OLD_NAMES[owner]:
         setattr(kind, old, OldAttribute(owner, old))
     setattr(kind, "__init_subclass__", classmethod(overridden))
-    if {*OLD_NAMES[owner].values()} & {*inspect.signature(kind).parameters}:
+    if arguments and {*OLD_NAMES[owner].values()} & {*inspect.signature(kind).parameters}:
         maker = "__new__" if issubclass(kind, tuple) else "__init__"
         setattr(kind, maker, with_old_arguments(owner, getattr(kind, maker)))
     return kind

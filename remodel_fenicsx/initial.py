@@ -21,10 +21,9 @@ from remodel_fenicsx.fem.formulations import FORMULATIONS
 from remodel_fenicsx.fem.kinematics import KINEMATICS, FreeLength, NaturalConfiguration
 from remodel_fenicsx.fem.quadrature import Quadrature
 from remodel_fenicsx.model.axes import GROWTH, NATURAL_GRADIENT, LocalAxes
-from remodel_fenicsx.model.energy import TURNED_OVER
 from remodel_fenicsx.model.tensors import Array, Flags, stretch_tensor
 from remodel_fenicsx.scene import Scene, SceneError
-from remodel_fenicsx.schema.settings import Cells, Turnover, in_region
+from remodel_fenicsx.schema.settings import Cells, in_region
 from remodel_fenicsx.state import State, UnitCells
 from remodel_fenicsx.system.files import command_name
 
@@ -81,7 +80,7 @@ def initial_states(scene: Scene, domain: Domain, fibres: Fibres) -> list[State]:
     quadrature = Quadrature(domain.mesh, scene.mesh.degree, made[0].weight(domain.mesh))
     properties, local_axes = scene.properties(), scene.geometry.local_axes(domain, quadrature)
     own = {name: properties[name].cells for name in scene.regions}
-    grows = scene.remodeling.turnover.grows
+    grows = bool(scene.remodeling.growth_key)
     if grows or not scene.is_stress_free:
         values, closed = np.eye(3), None
         if not scene.is_stress_free:
@@ -306,25 +305,11 @@ def _with_prestretch(measured: dict[str, Array], key: str, scene: Scene) -> dict
     if changed and wanted is None:
         rule = "set natural.fibres = true to start with them, or false to ignore them"
         raise SceneError(f"{key}: has {', '.join(changed)} of an earlier run; {rule}")
-    of_turnover = [name for name in TURNED_OVER if name in changed]
-    if wanted and of_turnover and not scene.remodeling.turnover.is_on:
-        raise SceneError(f"{key}: has {' and '.join(of_turnover)}, which needs remodeling.turnover")
-    if wanted and GROWTH in changed:
-        _check_growth(measured[GROWTH], key, scene.remodeling.turnover)
+    for process in scene.remodeling.processes:
+        problem = process.initial_problem({name: measured[name] for name in changed})
+        if wanted and problem:
+            raise SceneError(f"{key}: {problem}")
     return {name: values for name, values in measured.items() if wanted or name not in held}
-
-
-def _check_growth(growth: Array, key: str, turnover: Turnover) -> None:
-    """Check that the scene can continue the growth of an earlier run."""
-    if turnover.start:
-        raise SceneError(
-            f"{key}: has {GROWTH} of an earlier run; remodeling.turnover.from must be 0 with it"
-        )
-    if growth.min() <= 1.0 - turnover.volume:
-        volume = f"remodeling.turnover.volume must be above {1.0 - growth.min():.3g} with it"
-        raise SceneError(
-            f"{key}: has {GROWTH} of an earlier run, minimum {growth.min():.3g}; {volume}"
-        )
 
 
 def read_fibres(cells: Cells, region: str) -> FibreFile:
@@ -346,8 +331,8 @@ def _fibres_of(cells: Cells, region: str, corners: Array, chosen: Flags) -> dict
     except UnreadableFile as error:
         raise SceneError(f"{key} = {cells.fibres!r}: {error}") from error
     count, names = len(next(iter(file.measured.values()))), ", ".join(file.measured)
-    way = "by number" if farthest is None else f"nearest rows, largest distance {farthest:.3g}"
-    log.info("%s: %s of %d rows, %s; SHA-256 %s", key, names, count, way, file.sha256)
+    way = "by number" if farthest is None else f"by position, at most {farthest:.3g} away"
+    log.info("%s: %s read from %d rows %s; SHA-256 %s", key, names, count, way, file.sha256)
     return {name: values[rows] for name, values in file.measured.items()}
 
 

@@ -206,9 +206,9 @@ def _solver(scene: Scene) -> Solver:
 
 def _remodeling(scene: Scene, comm: MPI.Intracomm) -> Remodeling:
     """Return the remodeling settings; the path to a steady state with random cells is relaxed."""
-    # When the order of the driver's principal values changes, random cells jump at any step size,
-    # and the passes oscillate.
-    if not (scene.time.is_equilibrium and scene.has_random_cells and scene.has_order_jumps):
+    # When the driver's principal values change their order, random cells jump at any step size, and
+    # the passes oscillate.
+    if not (scene.time.is_equilibrium and scene.has_random_cells and scene.cell_order_can_change):
         return scene.remodeling
     if comm.rank == 0:
         log.info(
@@ -232,11 +232,19 @@ def _time_stepping(scene: Scene, stepper: Stepper) -> TimeStepping:
     from remodel_fenicsx.evolution import homeostasis
 
     unloads = any(load.decreases for load in scene.loads.values())
-    tolerance = time.tolerance or (homeostasis.UNLOADING if unloads else homeostasis.PATH_TOLERANCE)
-    if scene.has_random_cells and scene.has_order_jumps:
+    tolerance = time.tolerance or (
+        homeostasis.UNLOADING_PATH_TOLERANCE if unloads else homeostasis.PATH_TOLERANCE
+    )
+    if scene.has_random_cells and scene.cell_order_can_change:
         tolerance = homeostasis.NO_ERROR_CONTROL
-    held_from, hold = max(stops[:-1], default=0.0), scene.hold_before_change
-    plan = homeostasis.PathToRest(scene.last_time, stops, time.step, tolerance, held_from, hold)
+    plan = homeostasis.PathToSteadyState(
+        scene.last_time,
+        stops,
+        time.step,
+        tolerance,
+        last_load_change=max(stops[:-1], default=0.0),
+        first_hold=scene.hold_before_change,
+    )
     return homeostasis.Homeostasis(stepper, plan)
 
 
@@ -252,9 +260,11 @@ def watchers(scene: Scene, parts: SimulationParts) -> list[Watcher]:
     candidates += [
         make(scene, stepper) for process in stepper.remodels for make in process.watchers
     ]
-    for case in stepper.each_case[1:]:
+    for case in stepper.load_cases[1:]:
         case_watchers: list[Watcher | None] = [EquilibriumStability(case, unstable)]
-        case_watchers += [kind.make(scene, case) for kind in WATCHERS.values() if kind.each_case]
+        case_watchers += [
+            kind.make(scene, case) for kind in WATCHERS.values() if kind.checks_each_case
+        ]
         candidates += [
             case.adapt_watcher(watcher) for watcher in case_watchers if watcher is not None
         ]

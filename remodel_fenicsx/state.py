@@ -203,7 +203,7 @@ class Snapshot:
     time: float
     number: int
     numbers: dict[str, float]
-    others: tuple[Snapshot, ...] = ()
+    others: Sequence[Snapshot] = ()
 
 
 @with_old_names
@@ -225,6 +225,10 @@ class State:
 
     Attributes
     ----------
+    comm
+        Communicator of the mesh.
+    number_of_owned_unknowns
+        Number of unknowns that this rank owns; in arrays ghosts follow them.
     dilatation
         The formulation for these unknowns.
     equilibrium_cells
@@ -267,6 +271,9 @@ class State:
     ):
         self.unknown, self.kinematics = unknown, kinematics
         self.cells, self.loading = cells, loading
+        dofmap, mesh = unknown.function_space.dofmap, cells.quadrature.mesh
+        self.comm: MPI.Intracomm = mesh.comm
+        self.number_of_owned_unknowns = int(dofmap.index_map.size_local * dofmap.index_map_bs)
         self.dilatation = formulation.discretise(kinematics, unknown, cells.quadrature)
         F = kinematics.deformation_gradient(unknown)
         # G, if the mesh is not stress-free, and its initial value, if the body grows.
@@ -301,18 +308,6 @@ class State:
         self.counts: dict[str, str] = {}
         # The body starts unloaded. A load with a value at t = 0 acts from the first step on.
         loading.set(dict.fromkeys(loading.values, 0.0))
-
-    @property
-    def comm(self) -> MPI.Intracomm:
-        """Communicator of the mesh."""
-        quadrature = self.cells.quadrature
-        return quadrature.mesh.comm
-
-    @property
-    def number_of_owned_unknowns(self) -> int:
-        """Number of unknowns that this rank owns; in arrays ghosts follow them."""
-        space = self.unknown.function_space.dofmap
-        return int(space.index_map.size_local * space.index_map_bs)
 
     @cached_property
     def _dof_of_node(self) -> NDArray[np.int64]:
@@ -464,7 +459,7 @@ class State:
         number
             Number of steps so far.
         """
-        for case in self.each_case().values():
+        for case in (self, *self.other_cases):
             case.time, case.number = time, number
 
     def _add(self, function: dolfinx.fem.Function) -> None:
@@ -502,7 +497,7 @@ class State:
     def snapshot(self) -> Snapshot:
         """Return a copy of all values."""
         arrays = {name: array.copy() for name, array in self._arrays.items()}
-        others = tuple(case.snapshot() for case in self.other_cases)
+        others = [case.snapshot() for case in self.other_cases]
         return Snapshot(
             arrays, dict(self.loading.values), self.time, self.number, dict(self.numbers), others
         )

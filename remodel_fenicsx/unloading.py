@@ -23,6 +23,7 @@ from remodel_fenicsx.body.wall import RoundWall
 from remodel_fenicsx.model.residual_stress import Loads, close_ring
 from remodel_fenicsx.fem.assembly import raise_on_all_ranks
 from remodel_fenicsx.scene.scene import Scene, SceneError, too_soft
+from remodel_fenicsx.schema import processes
 from remodel_fenicsx.schema.settings import AS_GIVEN, EQUILIBRIUM, Natural
 from remodel_fenicsx.simulation import Simulation
 from remodel_fenicsx.solver.continuation import StepFailure
@@ -182,8 +183,9 @@ GEOMETRY_TOLERANCE = 1e-9  # relative tolerance of the loaded dimensions
 LOAD_STEPS = 10  # steps of a forward run to the end of the ramps
 # Settings without remodeling. Keys that belong to a law get their defaults.
 PASSIVE: dict[str, object] = {
-    "remodeling.law": "none", "remodeling.coupling": "staggered", "remodeling.turnover": {},
+    "remodeling.law": "none", "remodeling.coupling": "staggered",
     "remodeling.exponent": 2.0, "remodeling.threshold": 0.0, "time.tolerance": None,
+    **{f"remodeling.{name}": {} for name in processes.tables()},
 }  # fmt: skip
 
 
@@ -368,7 +370,7 @@ def _missed(simulation: Simulation, given: Array, share: float) -> Array:
     simulation.loading.set({name: share * value for name, value in loads.items()})
     dofs = dof_of_node(domain.mesh, unknown.function_space)
     unknown.x.array.reshape(-1, 3)[dofs] = given[domain.node_number] - domain.mesh.geometry.x
-    if not coupling.equilibrium.extension().admissible:
+    if not coupling.equilibrium.limits().admissible:
         raise ArithmeticError("no admissible state on the path: r >= L or J <= 0")
     change = coupling.newton.newton_correction(coupling.equilibrium, 0)
     distances: Array = domain.comm.bcast(domain.gather_nodes(-change.reshape(-1, 3)[dofs]))

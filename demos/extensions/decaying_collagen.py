@@ -49,9 +49,9 @@ class DecayingContent(Remodels):
         self.last, self.next = (
             math.exp(-self.fastest * moment) for moment in (self.state.time, time)
         )
-        self.set_part(1.0)
+        self.set_fraction(1.0)
 
-    def set_part(self, fraction):
+    def set_fraction(self, fraction):
         """Apply a fraction of the loss of the step."""
         self.content.x.array[:] = self.last + fraction * (self.next - self.last)
 
@@ -59,7 +59,7 @@ class DecayingContent(Remodels):
         """Return the relative loss that remains up to a time."""
         return 1.0 - math.exp(-self.fastest * (time - self.state.time))
 
-    def without_rest(self, waiting):
+    def steady_state_problem(self, waiting):
         """Return why the loss reaches no steady state."""
         return "collagen is lost at a constant rate: set time.end to a late time to follow the loss"
 

@@ -48,7 +48,7 @@ def shear_of_row(measurement) -> float:
     )
 
 
-WATCHERS["largest-shear"] = WatcherKind(ShearWarning.for_scene, each_case=True)
+WATCHERS["largest-shear"] = WatcherKind(ShearWarning.for_scene, checks_each_case=True)
 COLUMNS_ON_REQUEST["largest_shear"] = Column(
     "largest_shear", "degrees", "largest change of a right angle", shear_of_row
 )

@@ -156,7 +156,7 @@ def outcome(wall: Wall, stretch: float, gain: float) -> dict[str, Any]:
             for step in simulation.steps():
                 found |= {"time": step.time, "outer_radius": step.row["outer_radius"]}
                 rate = float(
-                    np.abs(simulation.stepper.turnover.rates()).max()
+                    np.abs(simulation.stepper.process("turnover").rates()).max()
                 )  # of content and natural length
                 if step.time > RAMP_END:
                     least = min(least, rate)

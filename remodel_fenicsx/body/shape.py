@@ -10,7 +10,7 @@ from abc import abstractmethod
 from collections.abc import Callable, Collection, Container, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
-from operator import attrgetter, methodcaller
+from operator import attrgetter
 from pathlib import Path
 from typing import Any, ClassVar, Literal, NamedTuple, TYPE_CHECKING
 
@@ -22,9 +22,9 @@ from remodel_fenicsx.body import reductions as reduced
 from remodel_fenicsx.model.axes import LocalAxes
 from remodel_fenicsx.model.cells import angle_to_axis, global_axes
 from remodel_fenicsx.model.tensors import Array
+from remodel_fenicsx.schema import processes
 from remodel_fenicsx.schema.settings import (
     NAME,
-    TURNOVER_POWER,
     Load,
     Mesh,
     OnFace,
@@ -195,14 +195,14 @@ COLUMNS: dict[str, Column] = {
             "max_chain_extension",
             "",
             "largest r/L of all chains, below 1; 0 if the chain law has no limit",
-            lambda m: m.step.extension.max_chain_extension,
+            lambda m: m.step.limits.max_chain_extension,
             extreme=True,
         ),
         Column(
             "min_jacobian",
             "",
             "smallest volume ratio J, always above 0",
-            lambda m: m.step.extension.min_jacobian,
+            lambda m: m.step.limits.min_jacobian,
             extreme=True,
         ),
         Column(
@@ -228,15 +228,8 @@ COLUMNS: dict[str, Column] = {
 """Columns of every shape by name, after `time` and the shape's columns; scripts may add columns."""
 
 
-def _turnover_warnings(name: str, unit: str, meaning: str, value: Callable[[Any], float]) -> Column:
-    """Make a column of a function of `evolution.turnover.Turnover`."""
-    return Column(
-        name,
-        unit,
-        meaning,
-        lambda m: float(value(m.observer.stepper.process("turnover"))),
-        by_case=False,
-    )
+def _of_process(process: str, value: Callable[..., float], m: Any) -> float:
+    return float(value(m.observer.stepper.process(process)))
 
 
 COLUMNS_ON_REQUEST: dict[str, Column] = {
@@ -272,32 +265,9 @@ COLUMNS_ON_REQUEST: dict[str, Column] = {
             by_case=False,
         ),
         *(
-            _turnover_warnings(
-                name,
-                "",
-                f"{what} of collagen over its initial value, volume mean; with remodeling.turnover",
-                methodcaller("mean", name),
-            )
-            for name, what in (("content", "amount"), ("natural_length", "natural length"))
-        ),
-        Column(
-            "growth",
-            "",
-            "stress-free volume of the tissue over its initial value; mean over the initial volume",
-            lambda m: m.quadrature.mean(m.observer.stepper.process("turnover").growth.ratio),
-            by_case=False,
-        ),
-        _turnover_warnings(
-            "collagen_share",
-            "",
-            "volume fraction of collagen in the tissue, mean over the initial volume",
-            methodcaller("collagen_share"),
-        ),
-        _turnover_warnings(
-            TURNOVER_POWER,
-            "stress length^3 / time",
-            "power that turnover releases at the row's F, without growth",
-            methodcaller("power"),
+            Column(name, unit, meaning, partial(_of_process, process, value), by_case=False)
+            for process, table in processes.tables().items()
+            for name, unit, meaning, value in table.columns
         ),
         Column(
             "cpu_seconds",

@@ -310,13 +310,8 @@ class Walled(WithAxes):
             {name: (words, lambda m, v: m.quadrature.nanmean(v, m.elements_of_region(name)))}
         )
 
-    def fibre_angle(self, dimensions: Array, axes: Array, local: Array) -> Array:
-        """Return the pitch of chains, degrees, (...,): circumferential 0, axial 90, else NaN."""
-        return pitch_angle(dimensions, axes, local)
-
-    def radial_share(self, dimensions: Array, axes: Array, local: Array) -> Array:
-        """Return the fraction of the chains across the wall, A_rr / tr A, (...,)."""
-        return radial_fraction(dimensions, axes, local)
+    fibre_angle = staticmethod(pitch_angle)  # type: ignore[assignment]
+    radial_share = staticmethod(radial_fraction)  # type: ignore[assignment]
 
 
 class RoundWall(Walled, WithRegions, Unloads):

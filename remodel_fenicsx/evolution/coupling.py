@@ -5,6 +5,7 @@ from __future__ import annotations
 import logging
 import math
 from collections.abc import Callable, Mapping
+from functools import cache, partial
 from typing import NamedTuple, Protocol
 
 import numpy as np
@@ -19,10 +20,10 @@ from remodel_fenicsx.model.cells import UnitCell
 from remodel_fenicsx.model.energy import Tissue
 from remodel_fenicsx.model.tensor_law import Target, weight_of_the_end
 from remodel_fenicsx.schema.settings import Solver
-from remodel_fenicsx.solver.attempts import FROM_EXPECTED, FROM_LAST, Attempt, attempted, say
+from remodel_fenicsx.solver.attempts import FROM_PREDICTION, FROM_PREVIOUS, Attempt, say
 from remodel_fenicsx.solver.continuation import CellHomotopy, Continuation, Work
 from remodel_fenicsx.solver.equilibrium import Equilibrium
-from remodel_fenicsx.solver.newton import GuardedNewton, SolveFailure
+from remodel_fenicsx.solver.newton import GuardedNewton, SolveFailure, attempted
 from remodel_fenicsx.state import FieldHistory, StateNumbers, State
 
 Array = NDArray[np.float64]
@@ -35,11 +36,11 @@ NO_TIME = -1.0  # time of a target before the first one
 # A point has its first target when the target's switch (1 under tension, 0 without; `tensor_law`)
 # reaches this. Below it the target changes the cells by less than the time error of a step.
 MIN_TARGET_WEIGHT = 0.01
-# Number of rates in the weighted sum that predicts the next rate, and number of known rates to
-# which its weights are fitted.
+# The next rate is predicted as a weighted sum of the last SUMMED rates, whose weights are fitted to
+# the last FITTED rates.
 SUMMED, FITTED = 3, 2
 SAME_RATE = 1e-9  # relative tolerance of equal load rates
-INDEPENDENT = 1e-12  # relative singular value below which rates depend on each other up to rounding
+DEPENDENT = 1e-12  # relative singular value; rates below it count as linearly dependent
 
 
 # ---------------------------------------------------------------- starting values of Newton
@@ -120,7 +121,7 @@ class Predictor:
         for k in range(FITTED):
             matrix += products[k + 1 : k + 1 + SUMMED, k + 1 : k + 1 + SUMMED]
             right += products[k + 1 : k + 1 + SUMMED, k]
-        return np.asarray(np.linalg.lstsq(matrix, right, rcond=INDEPENDENT)[0], dtype=np.float64)
+        return np.asarray(np.linalg.lstsq(matrix, right, rcond=DEPENDENT)[0], dtype=np.float64)
 
 
 @with_old_names
@@ -155,7 +156,7 @@ class Coupling(Protocol):
     A step has two halves, `solve` and `remodel`; the output row is taken between them. Both run
     inside the stepper's transaction. `RemodelingPass.apply` and `replace` change the cells and
     compute the power. Values that carry over from step to step belong to the state
-    (`State.remember`, `state.StateNumbers`). For each process in `RemodelingPass.beside` the
+    (`State.remember`, `state.StateNumbers`). For each of `RemodelingPass.additional_processes` the
     coupling calls `before`, then `settle` once equilibrium is reached, then `after`.
 
     Attributes
@@ -264,7 +265,7 @@ class Staggered:
         self._last = StateNumbers(state, "last_solution", {"extension": 0.0})  # largest r/L
         self.residual = 0.0
         self.tangents = 0  # assembled in the last solve of the state
-        changes = any(process.changes for process in (remodeling, *remodeling.beside))
+        changes = any(process.changes for process in (remodeling, *remodeling.additional_processes))
         self.blend = CellHomotopy(state, tissue, settings) if changes else None
 
     def solve(self, time: float, loads: LoadValues) -> Work:
@@ -275,12 +276,9 @@ class Staggered:
         StepFailure
             If no admissible equilibrium is found.
         """
-        self._before(time)
-        return self.solve_equilibrium(time, loads)
-
-    def _before(self, time: float) -> None:
-        for process in self.remodeling.beside:
+        for process in self.remodeling.additional_processes:
             process.before(time, self.traits.order)
+        return self.solve_equilibrium(time, loads)
 
     def solve_equilibrium(self, time: float, loads: LoadValues, again: bool = False) -> Work:
         """Solve for equilibrium with the present cells, then call `settle` of further processes.
@@ -302,15 +300,16 @@ class Staggered:
         before = unknown.x.array.copy()
         step = LoadStep.between(time - state.time, old_loads, loads)
         self._solve(step, time, old_loads, loads, work, again)
+        # A jump shows if cells and loads change together, in substeps from `before`.
         self._combined_change(time, old_loads, loads).check_for_jump(before, work, again)
         if self.predictor is not None:
             self.predictor.solved(step, before, again)
         state.mark_cells_in_equilibrium()
         self.residual = work.residual
-        work.extension = work.extension or self.equilibrium.extension()
-        self._last["extension"] = work.extension.max_chain_extension
+        work.limits = work.limits or self.equilibrium.limits()
+        self._last["extension"] = work.limits.max_chain_extension
         self.tangents = work.tangents
-        for process in self.remodeling.beside:
+        for process in self.remodeling.additional_processes:
             work.count(process.settle(time, again))
         return work
 
@@ -319,10 +318,9 @@ class Staggered:
         power = 0.0
         if self.remodeling.law.remodels:
             power = self.remodeling.apply(self.state.time, time, self.residual)
-        return power + self._after(time)
-
-    def _after(self, time: float) -> float:
-        return sum(process.after(time) for process in self.remodeling.beside)
+        for process in self.remodeling.additional_processes:
+            power += process.after(time)
+        return power
 
     @property
     def higher_order_cells(self) -> UnitCell | None:
@@ -332,7 +330,7 @@ class Staggered:
     def close(self) -> None:
         """Free the PETSc objects of the coupling."""
         self.newton.close()
-        for process in self.remodeling.beside:
+        for process in self.remodeling.additional_processes:
             process.close()
         if self.blend is not None:
             self.blend.close()
@@ -347,26 +345,26 @@ class Staggered:
         work: Work,
         again: bool,
     ) -> None:
-        """Solve by the attempts `FROM_EXPECTED`, `FROM_LAST` and `IN_PARTS` in this order."""
+        """Attempt `FROM_PREDICTION`, `FROM_PREVIOUS` and `IN_SUBSTEPS` in this order."""
         state, failure = self.state, None
         unknown, loading = state.unknown.x.array, state.loading
         before = unknown.copy()
         loading.set(loads)  # prescribed values are part of the prediction
-        if not again and self._starts_as_expected(step):
-            if not self._failure_of(FROM_EXPECTED, work, before):
+        if not again and self._set_prediction(step):
+            if not self._failure_of(FROM_PREDICTION, work, before):
                 return
         unknown[:] = before
         loading.set(old_loads)
-        if self.equilibrium.extension().admissible:
+        if self.equilibrium.limits().admissible:
             loading.set(loads)
-            failure = self._failure_of(FROM_LAST, work)
+            failure = self._failure_of(FROM_PREVIOUS, work)
             if not failure:
                 return
         else:
-            say(FROM_LAST, "the remodeled cells exceed r = L at the previous displacement")
-        self._solve_in_parts(time, old_loads, loads, work, failure)
+            say(FROM_PREVIOUS, "the remodeled cells exceed r = L at the previous displacement")
+        self._solve_in_substeps(time, old_loads, loads, work, failure)
 
-    def _starts_as_expected(self, step: LoadStep) -> bool:
+    def _set_prediction(self, step: LoadStep) -> bool:
         """Set the unknowns to the prediction, and return whether it exists and is admissible."""
         # If chains are almost straight in the prediction, the forces are huge, and Newton's method
         # needs many iterations. It needs fewer from the last displacement.
@@ -381,7 +379,7 @@ class Staggered:
         self, attempt: Attempt, work: Work, step_start: Array | None = None
     ) -> SolveFailure | None:
         """Solve from the present unknowns, and return the failure or None."""
-        outcome = attempted(lambda: self.newton.solve(step_start), SolveFailure)
+        outcome = attempted(partial(self.newton.solve, step_start), SolveFailure)
         work.add(outcome)
         if isinstance(outcome, SolveFailure):
             say(attempt, outcome.reason)
@@ -390,7 +388,7 @@ class Staggered:
         return None
 
     # ------------------------------------------------------------ substeps
-    def _solve_in_parts(
+    def _solve_in_substeps(
         self,
         time: float,
         old_loads: LoadValues,
@@ -402,16 +400,15 @@ class Staggered:
         # `failure` is that of the full step, if it was tried.
         loading, halvings = self.state.loading, self.settings.maximum_halvings
         loading.set(old_loads)
-        if self.blend is not None and self._has_remodeled():
-            blend = self.blend
+        if (blend := self.blend) is not None and self._has_remodeled():
             cell_change = Continuation(
                 time,
                 "the change of the cells",
-                self._set_part,
+                self._set_cell_fraction,
                 self.state,
                 lambda: blend.newton,
                 halvings,
-                blend.largest_part,
+                blend.largest_increment,
                 loose_tolerance=True,
             )
             cell_change.advance(work)
@@ -436,30 +433,35 @@ class Staggered:
         self, time: float, old_loads: LoadValues, new_loads: LoadValues
     ) -> Continuation:
         """Return the change of cells and loads together."""
-        blend = self.blend if self.blend is not None and self._has_remodeled() else None
+        blend = cache(lambda: self.blend if self._has_remodeled() else None)
 
         def set_fraction(fraction: float) -> None:
             self.state.loading.set(between(old_loads, new_loads, fraction))
-            if blend is not None:
-                self._set_part(fraction)
+            if blend() is not None:
+                self._set_cell_fraction(fraction)
 
-        halvings = self.settings.maximum_halvings
-        change = Continuation(
-            time, "the step", set_fraction, self.state, lambda: (blend or self).newton, halvings
+        def largest_increment(done: float) -> float:
+            return 1.0 if (homotopy := blend()) is None else homotopy.largest_increment(done)
+
+        return Continuation(
+            time,
+            "the step",
+            set_fraction,
+            self.state,
+            lambda: (blend() or self).newton,
+            self.settings.maximum_halvings,
+            largest_increment,
         )
-        if blend is not None:
-            change.largest_part = blend.largest_part
-        return change
 
-    def _set_part(self, fraction: float) -> None:
+    def _set_cell_fraction(self, fraction: float) -> None:
         """Apply a fraction of the remodeling since the last solved state."""
         assert self.blend is not None
         self.blend.set(fraction)
-        for process in self.remodeling.beside:
-            process.set_part(fraction)
+        for process in self.remodeling.additional_processes:
+            process.set_fraction(fraction)
 
     def _has_remodeled(self) -> bool:
-        if any(process.changes for process in self.remodeling.beside):
+        if any(process.changes for process in self.remodeling.additional_processes):
             return True
         are_equal = self.state.equilibrium_cells.equals(self.state.cells)
         return bool(self.state.comm.allreduce(int(not are_equal)) > 0)
@@ -507,15 +509,14 @@ class Extrapolated(Staggered):
         weight = weight_of_the_end(self.remodeling.kappa * self._duration)
         mean = target_from_records(self._older).towards(self._solved_target, weight)
         mean = mean.where(self._has_first_target, self._solved_target)
-        return self.remodeling.followed(mean, self._duration, self._start)
+        return self.remodeling.cells_towards(mean, self._duration, self._start)
 
     def solve(self, time: float, loads: LoadValues) -> Work:
         """Compute the new cells, and solve for equilibrium at `time` with them."""
         cells = self.state.cells
         self._start, expected = cells.point_cells.copy(), self._extrapolated(time)
         self._set_cells_after(expected, time)
-        self._before(time)
-        work = self.solve_equilibrium(time, loads)
+        work = super().solve(time, loads)
         self._solved_target = self.remodeling.target(self.residual)
         self._has_first_target = (self._newest["switch"] < MIN_TARGET_WEIGHT) & (
             self._solved_target.switch >= MIN_TARGET_WEIGHT
@@ -537,7 +538,9 @@ class Extrapolated(Staggered):
         self._older["time"][self._has_first_target] = NO_TIME  # no target before the first
         self._newest["direction"], self._newest["switch"] = self._solved_target
         self._newest["time"] = time
-        return self._power + self._after(time)
+        for process in self.remodeling.additional_processes:
+            self._power += process.after(time)
+        return self._power
 
     def _extrapolated(self, time: float) -> Target:
         """Return the target extrapolated to the middle of the step."""
@@ -552,10 +555,10 @@ class Extrapolated(Staggered):
         self._power = 0.0
         if not count_points(self.state, target.switch != 0.0):
             return
-        cells = self.remodeling.followed(target, duration)
+        cells = self.remodeling.cells_towards(target, duration)
         lost = ~np.isfinite(cells.dimensions).all(axis=-1)
         if lost.any():
-            cells = self.remodeling.followed(
+            cells = self.remodeling.cells_towards(
                 target.where(lost, target_from_records(self._newest)), duration
             )
         points = count_points(self.state, lost)

@@ -21,15 +21,15 @@ from remodel_fenicsx.body.loading import LoadValues
 from remodel_fenicsx.evolution.stepper import Step, Stepper, Watcher
 from remodel_fenicsx.evolution.time_steps import StepControl
 from remodel_fenicsx.fem import assembly
-from remodel_fenicsx.solver.attempts import attempted
 from remodel_fenicsx.solver.continuation import StepFailure, Work
+from remodel_fenicsx.solver.newton import attempted
 from remodel_fenicsx.state import Snapshot
 from remodel_fenicsx.system import NOTICE
 
 log = logging.getLogger(__name__)
 Array = NDArray[np.float64]
 
-PATH_TOLERANCE, UNLOADING = 3.0, 0.5
+PATH_TOLERANCE, UNLOADING_PATH_TOLERANCE = 3.0, 0.5
 """Time tolerance in degrees if the scene sets none: for monotonic loading, and for unloading or
 load reversal. With unloading, points lose their tension and keep the error of the path. The paper's
 artery takes 25 solves."""
@@ -41,42 +41,41 @@ LENGTHENING_OF_STEPS, LONGEST_AT_END = 1.5, 8.0
 """Growth factor of the largest step under constant loads while changes decrease, and its limit
 times kappa. At the limit a step is a pass to the limit within 0.03 %."""
 FRONT = 1.2
-"""Difference of A over r0^2 between neighbouring points that indicates a front. Chains of one
+"""Difference of A/r0^2 between neighbouring points that indicates a front. Chains of one
 direction that rotate by 58 degrees have this difference. The paper's artery has 0.67 at most; tubes
 with a front had 1.35 to 1.41."""
 STEADY_TOLERANCE = 1e-4
-"""Change of A over r0^2 in a time of 1/kappa at which the path ends. Changes of the slowest bodies
+"""Change of A/r0^2 in a time of 1/kappa at which the path ends. Changes of the slowest bodies
 seen decay at a twentieth of kappa: the remaining change before the tail is 0.002, a tenth of a
 degree."""
 MAX_HOLD = 100.0  # largest time under constant loads, times kappa
-# Change of A over r0^2 below which the tail is tried, and the factor by which it must decrease
+# Change of A/r0^2 below which the tail is tried, and the factor by which it must decrease
 # before the next trial.
 NEAR_REST, AGAIN = 0.01, 0.5
-# Maximum number of passes to the limit after the path, and the change over r0^2 that ends them.
+# Maximum number of passes to the limit after the path, and the change of A/r0^2 that ends them.
 TAIL_PASSES, TAIL = 15, 1e-9
 # Largest ratio of two changes in Aitken's extrapolation, which then goes 20 times as far as the
 # last change.
 LARGEST_RATIO = 0.95
 
 
-class PathToRest(NamedTuple):
+class PathToSteadyState(NamedTuple):
     """Path to the steady state: end, breakpoints, first step, and tolerance in degrees."""
 
-    # From `held_from` on all loads are constant. `before_change` is an earlier interval of constant
-    # loads in which a first steady state is reached.
+    # `first_hold` is an earlier interval of constant loads, which ends in a first steady state.
 
     end: float
     stops: Sequence[float]
     first: float
     tolerance: float
-    held_from: float
-    before_change: tuple[float, float] | None = None
+    last_load_change: float
+    first_hold: tuple[float, float] | None = None
 
 
 class Homeostasis:
     """Time integration over ramps and constant loads to the steady state, as one step."""
 
-    def __init__(self, stepper: Stepper, plan: PathToRest):
+    def __init__(self, stepper: Stepper, plan: PathToSteadyState):
         self.stepper, self.state = stepper, stepper.state
         self.plan = plan
         self.remodeling = stepper.remodeling
@@ -107,9 +106,9 @@ class Homeostasis:
         remembers = any(process.depends_on_path for process in self.remodels)
         traits = self.stepper.coupling.traits
         coarsens = not (traits.accumulates or self.plan.tolerance >= NO_ERROR_CONTROL or remembers)
-        if self.plan.before_change is not None:
-            self._equilibrate_before_growth(*self.plan.before_change, work)
-        held = max(start, self.plan.held_from)
+        if self.plan.first_hold is not None:
+            self._equilibrate_before_growth(*self.plan.first_hold, work)
+        held = max(start, self.plan.last_load_change)
         self._integrate(self.control, time, loads, held, coarsens, work)
         if coarsens and self._held is not None and self._largest_jump()[0] > FRONT:
             log.info(
@@ -132,7 +131,7 @@ class Homeostasis:
         self.state.mark_cells_in_equilibrium()
         log.info("steady state reached after %d steps, before time %g", self.steps, change)
         for process in self.remodels:
-            process.start_at_rest(change)
+            process.start_at_steady_state(change)
         self.state.complete_step(change, self.state.number)
 
     def _integrate(
@@ -160,7 +159,9 @@ class Homeostasis:
             work.substeps += step.work.substeps
             work.residual = step.work.residual
             log.info(
-                "on the path: time %g, %d Newton iterations", step.time, step.work.newton_iterations
+                "path to the steady state: time %g solved in %d Newton iterations",
+                step.time,
+                step.work.newton_iterations,
             )
             if state.time < held:
                 continue
@@ -193,7 +194,7 @@ class Homeostasis:
 
     def _has_no_rest(self, change: float, waiting: float) -> bool:
         """Return whether the path ends without a steady state, and warn."""
-        reasons = [process.without_rest(waiting) for process in self.stepper.remodels]
+        reasons = [process.steady_state_problem(waiting) for process in self.stepper.remodels]
         if reason := next(filter(None, reasons), ""):
             self._log(logging.WARNING, reason)
             return True

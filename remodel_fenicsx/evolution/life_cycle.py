@@ -29,8 +29,8 @@ class Remodels:
     meaningful. A change by `change_to_limit` is an array (elements, points, ...), such as
     (elements, points, 3, 3) for the cells.
 
-    With `changes` a subclass overrides `before` or `after`, `set_part` and `remaining_change`. For
-    an estimated time discretisation error it sets `components`, and overrides `row`,
+    With `changes` a subclass overrides `before` or `after`, `set_fraction` and `remaining_change`.
+    For an estimated time discretisation error it sets `components`, and overrides `solved_values`,
     `higher_order`, `set`, `as_components`, `with_change`, `after_pass` and `distance_between`
     together. For a steady state with `components` it also overrides `change_to_limit`, `size` and
     `apply_change`.
@@ -122,14 +122,14 @@ class Remodels:
         """
         return 0.0
 
-    def set_part(self, fraction: float) -> None:
+    def set_fraction(self, fraction: float) -> None:
         """Set the values to a fraction, from 0 to 1, of their change since the last equilibrium."""
 
     def close(self) -> None:
         """Free the PETSc objects of the values."""
 
     # ------------------------------------------------------------ time discretisation error
-    def row(self) -> Values:
+    def solved_values(self) -> Values:
         """Return the values of the solved state."""
 
     def higher_order(self) -> Values:
@@ -196,8 +196,8 @@ class Remodels:
     def begin_path(self) -> None:
         """Reset the monitors for a new path to the steady state."""
 
-    def without_rest(self, waiting: float) -> str:
-        """Return why there is no steady state, or an empty string.
+    def steady_state_problem(self, waiting: float) -> str:
+        """Return why there is no steady state, as text; an empty string if there may be one.
 
         Parameters
         ----------
@@ -206,5 +206,5 @@ class Remodels:
         """
         return ""
 
-    def start_at_rest(self, time: float) -> None:
-        """Start at a time if the process waits for a first steady state."""
+    def start_at_steady_state(self, time: float) -> None:
+        """Start at a time if the process waits for the first steady state."""

@@ -38,7 +38,7 @@ class FurtherCase(LoadCaseSolver):
         self.number, self.state = number, state
         self.load_values = load_values
         state.label = f"load case {number}: "
-        self.tissue, self.each_case = stepper.tissue, [self]
+        self.tissue, self.load_cases = stepper.tissue, [self]
         self.remodeling = RemodelingPass(state, stepper.tissue, stepper.remodeling.settings, kappa)
         self.coupling = Staggered(state, stepper.tissue, self.remodeling, solver)
         state.stop_signal = lambda: stepper.state.stop_signal()
@@ -56,10 +56,8 @@ class FurtherCase(LoadCaseSolver):
 
     def seen(self, step: Step) -> Step:
         """Return a copy of a step with the loads and limits of this load case."""
-        extension = self.coupling.equilibrium.extension()
-        return replace(
-            step, loads=dict(self.state.loading.values), extension=extension, case=self.number
-        )
+        limits = self.coupling.equilibrium.limits()
+        return replace(step, loads=dict(self.state.loading.values), limits=limits, case=self.number)
 
 
 class LoadCases(Remodels):
@@ -98,9 +96,9 @@ def join(
         for number, (state, values) in numbered
     ]
     stepper.state.join(states, weights)
-    stepper.each_case += cases
+    stepper.load_cases += cases
     stepper.remodeling.further += [case.drive for case in cases]
-    stepper.remodeling.beside.append(LoadCases(cases))
+    stepper.remodeling.additional_processes.append(LoadCases(cases))
 
 
 class FurtherCaseWatcher(Watcher):

@@ -28,7 +28,7 @@ from remodel_fenicsx.model.laws import (
     relaxed,
     tensor_target,
 )
-from remodel_fenicsx.model.tensor_law import ABOVE_ROUNDING, Target, switch_threshold
+from remodel_fenicsx.model.tensor_law import MIN_TENSION_OVER_ROUNDING, Target, switch_threshold
 from remodel_fenicsx.schema.settings import COUPLINGS, Remodeling
 from remodel_fenicsx.solver.equilibrium import PointStresses
 from remodel_fenicsx.state import StateNumbers, State, stress_rounding
@@ -36,19 +36,19 @@ from remodel_fenicsx.state import StateNumbers, State, stress_rounding
 log = logging.getLogger(__name__)
 Array = NDArray[np.float64]
 
-# Bound of the stress error: this factor times residual / smallest face area. The residual may
+# Bound of the stress error, as a multiple of residual / smallest face area. The residual may
 # act at one of the eight nodes of an element alone, and then corresponds to a stress of up to 8
 # times the force over the face area. A stress that is pulled back to the reference configuration is
 # larger still.
-RESIDUAL_SHARE = 20.0
+RESIDUAL_STRESS_FACTOR = 20.0
 # The bound that the residual gives is limited to this fraction of the body's stress. A tension
 # below the fraction carries hardly any load, and may be treated as zero.
-TYPICAL_SHARE = 1e-2
+MAX_RESIDUAL_STRESS_FRACTION = 1e-2
 # A warning is logged if (stress of the residual) / (body's stress) exceeds this. Measured for the
 # artery on one radius with the law "tensor": ratio 0.02 to 0.05, error of radii below 0.1 %; ratio
 # 0.4, error 2 %.
 WARNED_RESIDUAL_FRACTION = 0.1
-STRESS_ROUNDINGS = 64.0  # error of a principal value over the rounding of a stress
+STRESS_ROUNDINGS = 64.0  # error of a principal value as a multiple of a stress's rounding error
 MIN_ACTIVATION = 0.5  # switch below which a point counts as a point without tension
 LOOSE_SOLVER = (
     "the residual may correspond to stresses of up to %.2g (stress in the body: %.2g); stresses "
@@ -74,11 +74,10 @@ class RemodelingPass(Remodels):
         tissue: Tissue,
         settings: Remodeling,
         kappa: float | Function | None = None,
-        beside: Sequence[Remodels] = (),
+        additional_processes: Sequence[Remodels] = (),
     ):
-        # `beside` has the remodeling processes in addition to the cells.
         self.state, self.settings = state, settings
-        self.beside = list(beside)
+        self.additional_processes = list(additional_processes)
         self.quadrature = state.cells.quadrature
         # Drives of further load cases, which have the same cells.
         self.further: list[Callable[[], Drive]] = []
@@ -88,7 +87,7 @@ class RemodelingPass(Remodels):
         )
         self.parameters = state.parameters(tissue)
         self.driver, self.law = DRIVERS[settings.driver], LAWS[settings.law]
-        self.frame = FRAMES[settings.frame]
+        self.frame, self._own_parameters = FRAMES[settings.frame], settings.own_parameters
         self.set_kappa(settings.kappa if kappa is None else kappa)
         if (
             self.fastest == 0.0 and self.law.stops_at_zero_kappa
@@ -146,7 +145,7 @@ class RemodelingPass(Remodels):
         return self.state.elastic_gradient(), self._cached_tensor(evaluated)
 
     def drive(self, residual: float = 0.0) -> Drive:
-        """Return the drive of the present state, which was accepted with this residual norm."""
+        """Return what a law needs from the present state, accepted with this residual norm."""
         # With further load cases it is the mean over all cases.
         if not self.further:
             return self._own_drive(residual)
@@ -178,7 +177,7 @@ class RemodelingPass(Remodels):
             rounding=rounding,
             exponent=self.settings.exponent,
             least_tension=self.settings.threshold,
-            parameters=self.settings.own_parameters,
+            parameters=self._own_parameters,
         )
 
     def noise(self, F: Array, tensor: Array, residual: float) -> Noise:
@@ -197,8 +196,8 @@ class RemodelingPass(Remodels):
         rounded = rounding * (1 + self.quadrature.largest_gradient * displacement)
         squares = np.sum(tensor**2, axis=(1, 2)).reshape(self.quadrature.shape)
         typical = float(np.sqrt(self.quadrature.mean(squares)))
-        unbalanced = RESIDUAL_SHARE * residual / self._smallest_area
-        limit = max(TYPICAL_SHARE * typical, ABOVE_ROUNDING * rounded)
+        unbalanced = RESIDUAL_STRESS_FACTOR * residual / self._smallest_area
+        limit = max(MAX_RESIDUAL_STRESS_FRACTION * typical, MIN_TENSION_OVER_ROUNDING * rounded)
         if (
             unbalanced > max(WARNED_RESIDUAL_FRACTION * typical, limit)
             and not self._numbers["said"]
@@ -214,13 +213,14 @@ class RemodelingPass(Remodels):
         return noise
 
     def relative_switch_threshold(self) -> float:
-        """Return the switch threshold over the body's largest stress so far; 0 without loads."""
-        # Laws with a target remodel at half speed at this tension, and more slowly below it
+        """Return the switch threshold, relative to the body's largest stress so far."""
+        # It is 0 without loads, or while that stress is itself a rounding error. Laws with a target
+        # remodel at half speed at this tension, and more slowly below it
         # (`tensor_law.switch_threshold`).
         if not self.law.remodels or self.law.target is None or not self.driver.is_stress:
             return 0.0
         stress, floor = self._numbers["stress"], self._numbers["floor"]
-        return floor / stress if stress * ABOVE_ROUNDING > floor else 0.0
+        return floor / stress if stress * MIN_TENSION_OVER_ROUNDING > floor else 0.0
 
     def _max_chain_extension(self, F: Array) -> float:
         length = self.parameters.at_points().locking_length
@@ -232,12 +232,12 @@ class RemodelingPass(Remodels):
     def updated_cells(
         self, time_old: float, time_new: float, residual: float = 0.0, cells: UnitCell | None = None
     ) -> tuple[UnitCell, Array]:
-        """Return the present or other cells after a pass, and F (n, 3, 3)."""
+        """Compute the cells after a pass, and F (n, 3, 3); `cells` replace the present ones."""
         # Cells are flattened over the quadrature points. The state does not change.
         cells = self.state.cells.point_cells if cells is None else cells
         if self._averages_targets:
-            followed = self.followed(self.target(residual), time_new - time_old, cells)
-            return followed, self.state.elastic_gradient()
+            remodeled = self.cells_towards(self.target(residual), time_new - time_old, cells)
+            return remodeled, self.state.elastic_gradient()
         drive = self.drive(residual)
         return self.law.update(cells, drive, time_old, time_new), drive.deformation_gradient
 
@@ -268,8 +268,10 @@ class RemodelingPass(Remodels):
         inactive = np.linalg.eigvalsh(tensor)[:, -1] <= self.settings.threshold
         return float(self.quadrature.mean(inactive.reshape(self.quadrature.shape).astype(float)))
 
-    def followed(self, target: Target, duration: float, cells: UnitCell | None = None) -> UnitCell:
-        """Return the present or other cells after a time with a constant target; n points."""
+    def cells_towards(
+        self, target: Target, duration: float, cells: UnitCell | None = None
+    ) -> UnitCell:
+        """Compute the cells after a time of a constant target; `cells` replace the present ones."""
         assert self.law.follow is not None
         r0 = self.parameters.at_points().end_to_end_length
         return self.law.follow(
@@ -320,8 +322,8 @@ class RemodelingPass(Remodels):
         return self.quadrature.maximum(distance.reshape(self.quadrature.shape))
 
     # ------------------------------------------------------------ life cycle, see `Remodels`
-    def row(self) -> UnitCell:
-        """Return cells of the solved state."""
+    def solved_values(self) -> UnitCell:
+        """Get the cells of the solved state."""
         return UnitCell(*self.state.equilibrium_cells.point_cells[:2])
 
     def set(self, values: UnitCell) -> None:
@@ -353,17 +355,17 @@ class RemodelingPass(Remodels):
         return float(np.sqrt(self.quadrature.mean(angles**2)))
 
     def remaining_change(self, time: float, residual: float) -> float:
-        """Return the largest change of A by a pass, over r0^2."""
+        """Return the largest change of A/r0^2 by a pass."""
         return self.size(self._change_by_a_pass(time, residual))
 
     def change_to_limit(self, time: float, duration: float, residual: float) -> Array:
-        """Return the change of A by a pass to a late time, zero at points without tension."""
+        """Return the change of A by a pass up to `time`; zero at points without tension."""
         change = self._change_by_a_pass(time, residual)
         change[self.without_tension(residual).reshape(self.quadrature.shape)] = 0.0
         return change
 
     def size(self, change: Array) -> float:
-        """Return the largest change of A over r0^2."""
+        """Return the largest change of A/r0^2."""
         r0 = self.parameters.at_points().end_to_end_length.reshape(self.quadrature.shape)
         return self.quadrature.maximum(np.linalg.norm(change, axis=(-1, -2)) / r0**2)
 

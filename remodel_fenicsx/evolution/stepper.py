@@ -9,6 +9,7 @@ from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import closing, contextmanager
 from dataclasses import dataclass, field
 from decimal import Decimal
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar, Protocol
 
@@ -41,7 +42,7 @@ CHECK_INTERVAL = (
 )
 
 
-@with_old_names
+@partial(with_old_names, arguments=False)  # only steppers make steps
 @dataclass
 class Step:
     """Record of a time step, filled between the solution and the end of the step.
@@ -52,7 +53,7 @@ class Step:
         Time of the step, and its number; 0 is the unloaded body at the start.
     loads
         Magnitudes of the loads by name.
-    extension
+    limits
         Limits of the solved state: the largest chain extension r/L (`max_chain_extension`) and the
         smallest volume ratio J (`min_jacobian`).
     work
@@ -85,14 +86,14 @@ class Step:
     ...     print(step.number, step.time, step.loads, step.work.newton_iterations)
     1 1.0 {'force': 1.0} 4
     2 2.0 {'force': 2.0} 3
-    >>> round(step.extension.max_chain_extension, 4), step.label
+    >>> round(step.limits.max_chain_extension, 4), step.label
     (0.4769, 'time 2')
     """
 
     time: float
     number: int
     loads: LoadValues
-    extension: StateLimits
+    limits: StateLimits
     work: Work
     remodeling_power: float = 0.0
     seconds: float = 0.0
@@ -128,7 +129,7 @@ class Watcher:
     ...     value = 0.0
     ...
     ...     def committed(self, step):
-    ...         self.value = max(self.value, step.extension.max_chain_extension)
+    ...         self.value = max(self.value, step.limits.max_chain_extension)
     >>> scene = preset_scene("kuhl-holzapfel-2007", "cube").with_values({"time.end": 3.0})
     >>> watcher = LargestExtension()
     >>> for step in Simulation(scene).steps([watcher]):
@@ -286,7 +287,7 @@ class LoadCaseSolver:
         coupling.
     load_values
         Function of time that returns the magnitudes of all loads by name.
-    each_case
+    load_cases
         This load case and all further ones.
     """
 
@@ -295,7 +296,7 @@ class LoadCaseSolver:
     remodeling: RemodelingPass
     coupling: Coupling
     load_values: Callable[[float], LoadValues]
-    each_case: list[LoadCaseSolver]
+    load_cases: list[LoadCaseSolver]
 
     def adapt_watcher(self, watcher: Watcher) -> Watcher:
         """Return a watcher that passes each step to `watcher` with this load case's values."""
@@ -347,12 +348,12 @@ class Stepper(LoadCaseSolver):
         self.state, self._solver = state, solver
         self.load_values = load_values
         processes: list[Remodels] = []  # in addition to the cells
-        for kind in remodeling.beside:
+        for kind in remodeling.additional_kinds:
             processes.append(kind.make(state, tissue, remodeling))
             tissue = processes[-1].tissue or tissue
         self.tissue = state.parameters(tissue).tissue
         self.remodeling = RemodelingPass(state, self.tissue, remodeling, kappa, processes)
-        self.each_case = [self]
+        self.load_cases = [self]
         # For cells that never change the cheapest coupling is enough.
         name = remodeling.coupling if self.remodeling.law.remodels else "staggered"
         if processes and name != remodeling.coupling and state.comm.rank == 0:
@@ -368,8 +369,8 @@ class Stepper(LoadCaseSolver):
 
     @property
     def remodels(self) -> list[Remodels]:
-        """Remodeling processes: the cells first, then `RemodelingPass.beside`."""
-        return [self.remodeling, *self.remodeling.beside]
+        """Remodeling processes: the cells first, then the additional ones."""
+        return [self.remodeling, *self.remodeling.additional_processes]
 
     def process(self, name: str) -> Any:  # type: ignore[explicit-any]  # the name tells the class
         """Return the remodeling process of this name, or None.
@@ -409,13 +410,13 @@ class Stepper(LoadCaseSolver):
         """
         state, work = self.state, Work()
         if not state.number:
-            for case in self.each_case:
+            for case in self.load_cases:
                 equilibrate_prestretch(case.state, case.coupling.equilibrium, self._solver, work)
         step = Step(
             state.time,
             state.number,
             dict(state.loading.values),
-            self.coupling.equilibrium.extension(),
+            self.coupling.equilibrium.limits(),
             work,
         )
         for watcher in watchers:
@@ -432,7 +433,7 @@ class Stepper(LoadCaseSolver):
         is_last: bool = False,
         rejected: Step | None = None,
         coupling: Homeostasis | None = None,
-        measure_error: Callable[[Step], object] = lambda step: None,
+        measure_error: Callable[[Step], object] | None = None,
     ) -> Step:
         """Advance by one step: equilibrium with the loads of `time`, and remodeling.
 
@@ -478,11 +479,11 @@ class Stepper(LoadCaseSolver):
             )
         with state.transaction():
             work = (coupling or self.coupling).solve(time, self.load_values(time))
-            extension = work.extension or self.coupling.equilibrium.extension()
+            limits = work.limits or self.coupling.equilibrium.limits()
             if rejected is not None:
                 work.add(rejected.work)
             loads = dict(state.loading.values)  # also loads that `load_values` leaves unchanged
-            step = Step(time, state.number + 1, loads, extension, work, is_last=is_last)
+            step = Step(time, state.number + 1, loads, limits, work, is_last=is_last)
             with notify_undone(watchers, step):
                 for watcher in watchers:
                     watcher.solved(step)
@@ -492,7 +493,8 @@ class Stepper(LoadCaseSolver):
                 if rejected is not None:
                     step.seconds += rejected.seconds
                     step.processor_seconds += rejected.processor_seconds
-                measure_error(step)
+                if measure_error is not None:
+                    measure_error(step)
                 state.complete_step(time, step.number)
                 for watcher in watchers:
                     watcher.completed(step)
@@ -507,7 +509,7 @@ class Stepper(LoadCaseSolver):
         self,
         times: Iterable[float],
         watchers: Sequence[Watcher] = (),
-        measure_error: Callable[[Step], object] = lambda step: None,
+        measure_error: Callable[[Step], object] | None = None,
     ) -> Iterator[Step]:
         """Start, and yield each committed step up to the end of `times`.
 
@@ -585,7 +587,7 @@ class FixedSteps:
         stepper: Stepper,
         end: float,
         step: float,
-        measure_error: Callable[[Step], object] = lambda step: None,
+        measure_error: Callable[[Step], object] | None = None,
     ):
         self.stepper, self.measure_error = stepper, measure_error
         self.end, self.step = end, step
@@ -604,6 +606,7 @@ def equilibrate_prestretch(
 ) -> None:
     """Equilibrate a body with prestretch, in substeps as needed. Collective."""
     G, identity = state.natural_gradient, np.eye(3)
+    # The prestretch of a closed ring is in equilibrium already.
     if (
         G is None
         or state.kinematics.closed_ring is not None
@@ -673,7 +676,7 @@ def times(end: float, step: float) -> Iterator[float]:
 # ---------------------------------------------------------------- intended stops between two steps
 # A signal requests the stop, or the wall time limit requires it.
 
-MARGIN = 1.2  # wall time allowed for the next step over that of the longest recent step
+MARGIN = 1.2  # wall time reserved for the next step / that of the longest recent step
 NOT_ASKED, BY_SIGNAL, BY_CLOCK = range(3)
 REASONS = {BY_SIGNAL: "stopped by SIGUSR1", BY_CLOCK: "stopped before --max-wall-time is over"}
 

@@ -15,8 +15,9 @@ from numpy.typing import NDArray
 from remodel_fenicsx.evolution.life_cycle import Remodels, Values
 from remodel_fenicsx.evolution.stepper import LoadCaseSolver, Step, Stepper, Watcher
 from remodel_fenicsx.model.tensors import max_stretch_increment
-from remodel_fenicsx.solver.attempts import SHORTER_STEP, attempted, say
+from remodel_fenicsx.solver.attempts import SHORTER_STEP, say
 from remodel_fenicsx.solver.continuation import StepFailure
+from remodel_fenicsx.solver.newton import attempted
 from remodel_fenicsx.state import FieldHistory, StateNumbers
 
 log = logging.getLogger(__name__)
@@ -74,7 +75,7 @@ class TimeError:
     def measure(self, step: Step) -> Estimate:
         """Estimate the error of a step after its pass, within its transaction."""
         duration = step.time - self.state.time
-        rows = [process.row() for process in self.remodels]
+        rows = [process.solved_values() for process in self.remodels]
         betters = [self._better(process) for process in self.remodels]
         traits = self.stepper.coupling.traits
         if traits.accumulates:
@@ -186,7 +187,7 @@ class TimeError:
 
     def _stress_amplification(self, decay_rate: float, duration: float) -> float:
         """Return the amplification of an error by the stress since loads are constant."""
-        # It tends to kappa over the decay rate.
+        # It tends to kappa / decay rate.
         decay = float(np.exp(-decay_rate * duration))
         limit = self.kappa / decay_rate if decay_rate else 1.0
         amplification = max(1.0, decay * self._numbers["answer"] + (1.0 - decay) * limit)
@@ -195,7 +196,7 @@ class TimeError:
 
     def _held(self, step: Step) -> bool:
         """Return whether all loads were constant over the step."""
-        first, *further = self.stepper.each_case
+        first, *further = self.stepper.load_cases
         time, loads = self.state.time, [
             step.loads,
             *(case.state.loading.values for case in further),
@@ -216,7 +217,7 @@ class TimeError:
 
     def _strain(self, step: Step, remodeled: AllValues) -> tuple[float, bool]:
         """Return length change, in degrees, and admissibility of the linear response."""
-        cases = self.stepper.each_case
+        cases = self.stepper.load_cases
         before = [case.state.elastic_gradient() for case in cases]
         for process, values in zip(self.remodels, remodeled, strict=True):
             process.set(values)
@@ -232,7 +233,7 @@ class TimeError:
         """Return length change and admissibility of one load case; `before` is its earlier F_e."""
         state, equilibrium = case.state, case.coupling.equilibrium
         state.unknown.x.array[:] += case.coupling.newton.newton_correction(equilibrium, tangents)
-        after, admissible = state.elastic_gradient(), equilibrium.extension().admissible
+        after, admissible = state.elastic_gradient(), equilibrium.limits().admissible
         changes = np.minimum(max_stretch_increment(before, after), LARGEST_LINEAR_CHANGE)
         changes = changes.reshape(self.quadrature.shape)
         return float(np.degrees(self.quadrature.maximum(changes))), admissible
@@ -254,20 +255,20 @@ def _accumulated_error(difference: float, forgotten: float) -> float:
 # rejected.
 
 SAFETY_FACTOR = 0.85  # the next step aims at this fraction of the tolerance
-KEPT, WORTHWHILE = 0.9, 1.5  # optimal over present step size between which the size stays
+KEPT, WORTHWHILE = 0.9, 1.5  # optimal / present step size between which the size stays
 LENGTHENING, SHRINKAGE = 2.0, 0.1  # limits of the ratio of two step sizes
 HALVED = 0.5  # largest factor after a second rejection, because the error hardly decreases
 STRETCHED = 1.05  # factor by which steps may grow if that saves one before a breakpoint
-SMALLEST = 2.0**-12  # minimum over the first step: unsolved steps are not reduced further
+SMALLEST = 2.0**-12  # minimum / first step size: unsolved steps are not reduced further
 # Largest rotation of chains in degrees while cells remodel or loads go from one breakpoint to the
 # next.
 FASTEST = 360.0
 # Number of steps of minimum size above the tolerance, in the time of `_fastest_time`, after which
 # larger steps follow.
 MAX_FUTILE_STEPS = 20
-NEAR_TOLERANCE = 4.0  # error over the tolerance below which smaller steps are tried again
+NEAR_TOLERANCE = 4.0  # error / tolerance below which smaller steps are tried again
 FAILED_STEPS = 3  # maximum number of failed steps in sequence, each a quarter of the step before
-MIN_ERROR = 1e-4  # smallest error over the tolerance that affects the next step size
+MIN_ERROR = 1e-4  # smallest error / tolerance that affects the next step size
 
 
 class StepRejectedError(Exception):

@@ -15,7 +15,8 @@ from remodel_fenicsx.fem.kinematics import NaturalConfiguration
 from remodel_fenicsx.model.axes import GROWTH
 from remodel_fenicsx.model.energy import TURNED_OVER, Tissue
 from remodel_fenicsx.model.laws import TurnoverRates
-from remodel_fenicsx.schema.settings import Remodeling, Turnover
+from remodel_fenicsx.schema.processes.turnover import Turnover
+from remodel_fenicsx.schema.settings import Remodeling
 from remodel_fenicsx.solver.continuation import StepFailure, Work
 from remodel_fenicsx.solver.diagnosis import FailureCause
 from remodel_fenicsx.state import FieldHistory, StateNumbers, State
@@ -25,7 +26,7 @@ if TYPE_CHECKING:
 
 Array = NDArray[np.float64]
 
-# Smallest volume over the initial volume. Below it hardly any tissue is left, and the step fails.
+# Smallest volume, relative to the initial one. With less the tissue is lost, and the step fails.
 LEAST_VOLUME = 0.05
 TISSUE_LOST = FailureCause(
     "lost tissue", "lower remodeling.turnover.volume or gain, or raise the loads"
@@ -85,7 +86,7 @@ class Growth:
             1.0 + self.settings.volume * (content / self._reference.reshape(content.shape) - 1.0)
         )
 
-    def follow(self, content: Array) -> None:
+    def set_content(self, content: Array) -> None:
         """Set J_g = 1 + phi (m/m_ref - 1) and G = G_0 (1 - (1 - 1/J_g) N (x) N)."""
         if self.state.time < self.start:
             self._reference[:] = content
@@ -112,7 +113,7 @@ class Growth:
 
 
 class DecayMonitor:
-    """Monitor of a rate: does it decay faster than 1/t, with t since loads are constant?"""
+    """Monitor of a rate: does it decay faster than 1/t, t being the time under constant loads?"""
 
     # It compares the rate at t with an earlier rate, taken between t/4 and t/2.
 
@@ -145,7 +146,7 @@ class TurnoverPass(Remodels):
     changes, depends_on_path = True, True
 
     def __init__(self, state: State, tissue: Tissue, remodeling: Remodeling):
-        settings = remodeling.turnover
+        settings: Turnover = getattr(remodeling, self.name)
         assert settings.time is not None
         self.state, self.settings = state, settings
         self.quadrature = state.cells.quadrature
@@ -208,7 +209,7 @@ class TurnoverPass(Remodels):
         self._present = changed(self._step_start, rates, duration)
         self.set(self._present)
 
-    def set_part(self, fraction: float) -> None:
+    def set_fraction(self, fraction: float) -> None:
         """Apply a fraction of the change since the last solved state."""
         self.set(self._last_solved + fraction * (self._present - self._last_solved))
 
@@ -230,7 +231,7 @@ class TurnoverPass(Remodels):
         return 0.0
 
     # ------------------------------------------------------------ error and steady state
-    def row(self) -> Array:
+    def solved_values(self) -> Array:
         """Return ln m and ln rho of the solved state."""
         return self._present
 
@@ -268,19 +269,19 @@ class TurnoverPass(Remodels):
 
     def apply_change(self, change: Array, factor: float, time: float, residual: float) -> None:
         """Apply a multiple of the change of `change_to_limit`."""
-        self.change(change.reshape(-1, 2).T, factor)
+        self.change(change.reshape(-1, 2).T, factor)  # as rates over a duration
 
     def begin_path(self) -> None:
         """Reset the monitor of the rates."""
-        self._slowing = DecayMonitor(dict(DecayMonitor.INITIAL))
+        self._decay = DecayMonitor(dict(DecayMonitor.INITIAL))
 
-    def without_rest(self, waiting: float) -> str:
-        """Return text if the natural length changed much and rates decay no faster than 1/t."""
-        goes_on = self._slowing.is_unbounded(
+    def steady_state_problem(self, waiting: float) -> str:
+        """Return text if the natural length changed much, and rates decay no faster than 1/t."""
+        is_unbounded = self._decay.is_unbounded(
             waiting, self.quadrature.maximum(self.fastest_changes())
         )
         if (
-            not goes_on
+            not is_unbounded
             or self.quadrature.maximum(self.factors("natural_length")) <= MIN_UNBOUNDED_FACTOR
         ):
             return ""
@@ -290,7 +291,7 @@ class TurnoverPass(Remodels):
             f"{self.state.time:g}; try a larger remodeling.turnover.gain"
         )
 
-    def start_at_rest(self, time: float) -> None:
+    def start_at_steady_state(self, time: float) -> None:
         """Start volumetric growth at a time."""
         if self.growth is not None:
             self.growth.start = time
@@ -305,7 +306,7 @@ class TurnoverPass(Remodels):
         for name, values in zip(TURNED_OVER, np.exp(logarithms), strict=True):
             getattr(self.tissue, name).x.array[:] = values
         if self.growth is not None:
-            self.growth.follow(self._values("content"))
+            self.growth.set_content(self._values("content"))
 
     def rates(self, present: bool = False) -> Array:
         """Return d ln m / dt and d ln rho / dt of the row, (2, n); mean over load cases."""
@@ -335,6 +336,11 @@ class TurnoverPass(Remodels):
         """Return the volume mean of `content` or `natural_length`."""
         return float(self.quadrature.mean(self._values(name)))
 
+    def mean_volume_ratio(self) -> float:
+        """Return the volume mean of `Growth.ratio`, for tissue that grows."""
+        assert self.growth is not None
+        return float(self.quadrature.mean(self.growth.ratio))
+
     def collagen_share(self) -> float:
         """Return the volume mean of `Growth.share`, for tissue that grows."""
         assert self.growth is not None
@@ -356,7 +362,7 @@ class TurnoverPass(Remodels):
 # Number of turnover times under constant loads before a warning. In walls with a steady state the
 # rates have risen to their maximum by then, and decrease.
 MIN_TURNOVER_TIMES = 10.0
-FAR_FROM_REST = 0.01  # smallest change of ln m or ln rho per turnover time that is reported
+FAR_FROM_STEADY_STATE = 0.01  # smallest change of ln m or ln rho per turnover time that is reported
 
 
 class UnboundedGrowth(WarnsOnce):
@@ -364,9 +370,9 @@ class UnboundedGrowth(WarnsOnce):
 
     name, initial = "growth", DecayMonitor.INITIAL
 
-    def __init__(self, stepper: Stepper, held_from: float):
+    def __init__(self, stepper: Stepper, last_load_change: float):
         super().__init__(stepper)
-        self.held_from, self._slowing = held_from, DecayMonitor(self._numbers)
+        self.last_load_change, self._decay = last_load_change, DecayMonitor(self._numbers)
         self.turnover = stepper.process(TurnoverPass.name)
 
     @classmethod
@@ -374,26 +380,26 @@ class UnboundedGrowth(WarnsOnce):
         return cls(stepper, scene.end_of_ramps)
 
     def due(self, step: Step) -> bool:
-        return step.time > self.held_from
+        return step.time > self.last_load_change
 
     def check(self, step: Step) -> str:
         """Check the rates under constant loads."""
-        elapsed, period = step.time - self.held_from, self.turnover.settings.time
+        elapsed, period = step.time - self.last_load_change, self.turnover.settings.time
         rates = self.turnover.fastest_changes()
         rate = self.quadrature.maximum(rates)
-        goes_on = self._slowing.is_unbounded(elapsed, rate)
+        is_unbounded = self._decay.is_unbounded(elapsed, rate)
         if not (
-            goes_on
+            is_unbounded
             and step.is_last
             and elapsed >= MIN_TURNOVER_TIMES * period
-            and rate * period >= FAR_FROM_REST
+            and rate * period >= FAR_FROM_STEADY_STATE
         ):
             return ""
         return (
             "turnover has not reached equilibrium: content or natural length change by up to "
             f"{100 * rate * period:.2g} % within one remodeling.turnover.time, most at "
             f"{self.quadrature.shown_place_of_largest(rates)}, and the rates have decayed no "
-            f"faster than 1/t since time {self.held_from + self._numbers['early_time']:g} "
+            f"faster than 1/t since time {self.last_load_change + self._numbers['early_time']:g} "
             "(mechanobiological instability, docs/tissue_that_lives.md). "
             "Try a larger remodeling.turnover.gain"
         )

@@ -348,8 +348,9 @@ def _exclusive(kernel: str) -> Iterator[None]:
                     path.unlink(missing_ok=True)
         except OSError as error:  # some network file systems have no locks
             log.warning(
-                "%s cannot be locked (%s): runs that compile at the same time may fail, or wait "
-                "for a killed one until they fail; set XDG_CACHE_HOME to a folder on a local disk",
+                "%s cannot be locked (%s): runs that compile at the same time may fail, and after "
+                "a killed run others may wait until they time out; set XDG_CACHE_HOME to a folder "
+                "on a local disk",
                 lock.name,
                 error.strerror,
             )

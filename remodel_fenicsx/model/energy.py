@@ -712,7 +712,7 @@ class Tissue:
         F, r0 = deformation_gradient, self.end_to_end_length
         if self.chain is None:
             return 0.0 * det(F)
-        squared, squared_after = (squared_end_to_end_length(F, [cell]) for cell in (old, new))
+        squared, squared_after = [squared_end_to_end_length(F, [cell]) for cell in (old, new)]
         stiffness = self.chain.stiffness(self.normalised_length(sqrt(squared)), self.contour_length)
         if self.natural_length is not None:
             stiffness = stiffness / self.natural_length**2

@@ -255,11 +255,8 @@ def ranked(
     >>> del LAWS["euler"]
     """
 
-    def update(cells: UnitCell, drive: Drive, time_old: float, time_new: float) -> UnitCell:
-        return by_rank(function, cells, drive, time_old, time_new)
-
     return Law(
-        update,
+        partial(by_rank, function),
         has_limit,
         depends_on_absolute_time=depends_on_absolute_time,
         keeps_symmetry=True,

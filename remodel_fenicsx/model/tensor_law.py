@@ -20,7 +20,7 @@ COMPRESSION = 0.01
 """Weight of the squared compression against the squared tension. The switch is one half if
 n+ = COMPRESSION n-, a tension of a tenth of the compression."""
 
-ABOVE_ROUNDING = 7000.0
+MIN_TENSION_OVER_ROUNDING = 7000.0
 """Threshold of the switch over the rounding of a principal value (1e-10 of the stiffness), wide
 enough that the switch is smooth for Newton's method."""
 
@@ -29,7 +29,7 @@ def switch_threshold(noise: Array | float, rounding: Array | float) -> Array | f
     """Return the tension at which the switch is one half without compression."""
     # The noise from the solver's residual is not multiplied like the rounding: the product would be
     # as large as a stress.
-    return ABOVE_ROUNDING * rounding + noise
+    return MIN_TENSION_OVER_ROUNDING * rounding + noise
 
 
 class Target(NamedTuple):

@@ -517,9 +517,8 @@ def facts(run: ReportedRun) -> Card:
     """List the scene's tables, with results of the run such as its number of steps."""
     scene, history = run.recording.scene, run.recording.history
     tables = defaultdict[str, list[str]](list)
-    without = (
-        NO_PHYSICS if scene.remodeling.turnover.is_on else (*NO_PHYSICS, "remodeling.turnover")
-    )
+    off = [f"remodeling.{one.name}" for one in scene.remodeling.processes if not one.is_on]
+    without = (*NO_PHYSICS, *off)
     for key, value in leaves(scene.model_dump(exclude_none=True), without):
         path, _, name = key.rpartition(".")
         path = re.sub(r"^cases\[(\d+)\]", lambda number: f"load case {int(number[1]) + 1}", path)

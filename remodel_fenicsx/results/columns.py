@@ -66,7 +66,7 @@ class Observer(Watcher):
         self.quadrature: Quadrature = self.state.cells.quadrature
         self.domain: Domain = self.state.loading.domain
         self.tools: dict[object, Any] = {}
-        self.others = [Observer(shape, case, ()) for case in stepper.each_case[1:]]
+        self.others = [Observer(shape, case, ()) for case in stepper.load_cases[1:]]
 
     # ------------------------------------------------------------ as a watcher
     def started(self, step: Step) -> None:

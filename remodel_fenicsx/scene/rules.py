@@ -17,17 +17,15 @@ from remodel_fenicsx.fem.formulations import FORMULATIONS
 from remodel_fenicsx.fem.kinematics import KINEMATICS
 from remodel_fenicsx.fem.solver_methods import SOLVER_METHODS
 from remodel_fenicsx.model.chains import CHAINS
-from remodel_fenicsx.model.energy import TURNED_OVER
 from remodel_fenicsx.model.laws import LAWS, MEANS_OF_CASES
 from remodel_fenicsx.scene.scene import Scene
+from remodel_fenicsx.schema.processes import ProcessTable
 from remodel_fenicsx.schema.settings import (
     COUPLINGS,
     EQUILIBRIUM,
-    GROWTH_COLUMNS,
     MEASURED_CELLS,
     NAME,
     SUM_OF_WEIGHTS,
-    TURNOVER_POWER,
     in_region,
     laws_with_a_target,
 )
@@ -57,7 +55,7 @@ def named_regions(scene: Scene) -> Faults:
 
 def tissue_of_regions(scene: Scene) -> Faults:
     """Check the keys of regions together with those of the whole body."""
-    law, turnover = LAWS[scene.remodeling.law], scene.remodeling.turnover
+    law = LAWS[scene.remodeling.law]
     for name, (material, cells, kappa) in scene.properties().items():
         region, length = in_region(name), cells.end_to_end_length
         if CHAINS[material.chain].locks and length >= material.contour_length:
@@ -82,16 +80,6 @@ def tissue_of_regions(scene: Scene) -> Faults:
                     "another law"
                 )
             yield rule, f"{region}{key}", value
-        if not turnover.is_on:
-            continue
-        if not material.chain_density:
-            rule = f"needs chains: {region}material.chain_density above 0"
-            yield rule, "remodeling.turnover", None
-        longest = material.contour_length / length
-        if CHAINS[material.chain].locks and turnover.deposition_stretch >= longest:
-            most = f"{region}contour_length / end_to_end_length = {format_value(longest)}"
-            rule = f"must be smaller than {most}"
-            yield rule, "remodeling.turnover.deposition_stretch", turnover.deposition_stretch
 
 
 def meshed_body(scene: Scene) -> Faults:
@@ -311,18 +299,26 @@ def coupling_and_mean(scene: Scene) -> Faults:
         yield f"must be one of {able} with [[cases]]", "remodeling.coupling", remodeling.coupling
 
 
-def growth(scene: Scene) -> Faults:
-    """Check that the body can grow, and that growth starts at a time of the run."""
-    turnover, time = scene.remodeling.turnover, scene.time
-    if not turnover.grows:
-        return
-    key, volume = "remodeling.turnover.volume", turnover.volume
-    if not isinstance(scene.geometry, Walled):
-        yield f"must be 0 unless geometry.shape is {_shapes(Walled, ' or ')}", key, volume
-    if scene.formulation != "displacement":
-        yield "must be 0 unless mesh.formulation is 'displacement'", key, volume
-    key, start = "remodeling.turnover.from", turnover.start
-    if turnover.starts_at_rest:
+def additional_processes(scene: Scene) -> Faults:
+    """Check that the tissue of all regions has the processes, and that they start in the run."""
+    for process in scene.remodeling.processes:
+        for region, properties in scene.properties().items():
+            if process.is_on:
+                yield from process.faults_in(in_region(region), properties.tissue)
+        yield from _start_of(scene, process)
+        if not process.growth_key:
+            continue
+        key, value = scene.remodeling.growth_key, getattr(process, process.growth_key)
+        if not isinstance(scene.geometry, Walled):
+            yield f"must be 0 unless geometry.shape is {_shapes(Walled, ' or ')}", key, value
+        if scene.formulation != "displacement":
+            yield "must be 0 unless mesh.formulation is 'displacement'", key, value
+
+
+def _start_of(scene: Scene, process: ProcessTable) -> Faults:
+    """Check that a process starts at a time of the run, or at a steady state on the load path."""
+    time, key = scene.time, f"remodeling.{process.name}.{process.start_key}"
+    if process.starts_at_equilibrium:
         if not time.is_equilibrium:
             yield "needs time.end = 'equilibrium'; otherwise set a time", key, EQUILIBRIUM
         if scene.last_hold is None:
@@ -330,13 +326,14 @@ def growth(scene: Scene) -> Faults:
             yield rule, key, EQUILIBRIUM
         if scene.cases:
             yield "needs a scene without [[cases]]", key, EQUILIBRIUM
-    elif start and time.is_equilibrium:
-        rule = "time.end = 'equilibrium' has no time axis; set 0 or 'equilibrium'"
-        yield rule, key, start
-    elif start and start > time.end:
-        yield f"must be at most time.end = {format_value(time.end)}", key, start
-    elif start:
-        time.check_step_time(start, key)
+    for start in process.stops:
+        if time.is_equilibrium:
+            rule = "time.end = 'equilibrium' has no time axis; set 0 or 'equilibrium'"
+            yield rule, key, start
+        elif start > time.end:
+            yield f"must be at most time.end = {format_value(time.end)}", key, start
+        else:
+            time.check_step_time(start, key)
 
 
 def equilibrium(scene: Scene) -> Faults:
@@ -392,18 +389,16 @@ def fields_of_the_body(scene: Scene) -> Faults:
 
 def columns_of_the_history(scene: Scene) -> Faults:
     """Check that the scene has the output columns."""
-    shape, turnover = scene.geometry, scene.remodeling.turnover
-    key = "output.columns"
+    shape, key = scene.geometry, "output.columns"
     of_one_tissue = {column.name for column in shape.columns_on_request if column.of_one_tissue}
     for name in scene.output.columns:
         if name == "time_error" and scene.time.is_equilibrium:
             yield f"{name!r} needs time steps; not allowed with time.end = 'equilibrium'", key, name
         if name in of_one_tissue and scene.regions:
             yield f"{name!r} is only for bodies without regions; the scene has regions", key, name
-        if name in (*TURNED_OVER, TURNOVER_POWER) and not turnover.is_on:
-            yield f"{name!r} changes only with remodeling.turnover, which is not set", key, name
-        if name in GROWTH_COLUMNS and not turnover.grows:
-            yield f"{name!r} needs remodeling.turnover with a volume above 0", key, name
+        for process in scene.remodeling.processes:
+            if name in process.absent:
+                yield process.absent[name], key, name
         if name not in (known := dict.fromkeys(scene.column_names)):
             names = listed(map(repr, known), repr(name))
             yield f"no such column on request; allowed for shape {shape.name!r}: {names}", key, name
@@ -446,7 +441,7 @@ RULES = (
     loads_of_the_body,
     weights_and_factors,
     coupling_and_mean,
-    growth,
+    additional_processes,
     equilibrium,
     unknown_length,
     times_of_output,

@@ -186,8 +186,9 @@ def too_soft(scene: Scene, wall: object = None) -> Iterator[str]:
     if stress > most:
         unit = scene.material.stress_unit
         yield (
-            f"loads.pressure.value: the largest p r/h is {stress:.3g} {unit}, but with chains at "
-            f"r = {NEAR_LOCKING:g} L the tissue bears {most:.3g} {unit}. The tissue is too soft: "
+            "loads.pressure.value: the largest pressure causes a mean wall stress of "
+            f"{stress:.3g} {unit}, but with chains at {100 * NEAR_LOCKING:g} % of their contour "
+            f"length the tissue bears {most:.3g} {unit}. The tissue is too soft: "
             "steps take minutes or fail; check material.stress_unit"
         )
 
@@ -232,8 +233,6 @@ PARTS_OF_MATERIAL = {"chain": CHAINS, "matrix": MATRICES, "repulsion": REPULSION
 FORMAT = 2  # format of recorded scenes; increased if earlier versions could not read them
 # per kind of table; each table is checked against all others and has its own columns
 MOST_TABLES = 200
-# value of k a below which a wall with turnover takes more than about 5 T for a factor of e
-SLOW_REST = 3.0
 # times 1/kappa: no trace of the start is left, also in cells below a hundredth of a tension
 STEADY_STATE_TIME = 1000.0
 
@@ -408,8 +407,8 @@ class Scene(Table):
             return f"remodeling.coupling = {self.remodeling.coupling!r}"
         if not self.is_stress_free:
             return "[natural]" if not self.natural.is_trivial else "material.elastin"
-        if self.remodeling.turnover.grows:
-            return "remodeling.turnover.volume above 0"
+        if key := self.remodeling.growth_key:
+            return f"{key} above 0"
         if not self.material.has_volumetric_split:
             return f"material.matrix = {self.material.matrix!r}"
         return "homogeneous deformation" if KINEMATICS[choice(self).name].homogeneous else ""
@@ -430,7 +429,8 @@ class Scene(Table):
     @property
     def hold_before_change(self) -> tuple[float, float] | None:
         """Start and end of the hold in which cells reach equilibrium before growth, or None."""
-        return self.last_hold if self.remodeling.turnover.starts_at_rest else None
+        waits = any(process.starts_at_equilibrium for process in self.remodeling.processes)
+        return self.last_hold if waits else None
 
     @property
     def last_hold(self) -> tuple[float, float] | None:
@@ -450,7 +450,7 @@ class Scene(Table):
         if not self.time.is_equilibrium:
             return float(self.time.end)
         rates = [properties.kappa for properties in self.properties().values()]
-        rates += [1 / self.remodeling.turnover.time] if self.remodeling.turnover.time else []
+        rates += [one.rate for one in self.remodeling.processes if one.rate]
         return self.end_of_ramps + STEADY_STATE_TIME / min(rates)
 
     def each_case(self) -> list[Scene]:
@@ -490,7 +490,7 @@ class Scene(Table):
         )
 
     @property
-    def has_order_jumps(self) -> bool:
+    def cell_order_can_change(self) -> bool:
         """Whether the law is ranked and the lengths of cells vary, so that their order can jump."""
         return LAWS[self.remodeling.law].is_ranked and (
             self.has_random_cells or bool(self.measured_cells)
@@ -532,8 +532,8 @@ class Scene(Table):
         """Return the times that steps hit exactly: corners of ramps, output.times and the end."""
         end = self.last_time
         times = {time for load in self.loads.values() for time, _ in load.ramp if 0 < time < end}
-        growth = {self.remodeling.turnover.start} - {0.0, math.inf}
-        return sorted({*times, *growth, *self.output.times, end})
+        times.update(*(process.stops for process in self.remodeling.processes))
+        return sorted({*times, *self.output.times, end})
 
     @property
     def load_kinds(self) -> dict[str, LoadKind]:
@@ -543,26 +543,18 @@ class Scene(Table):
     @property
     def lacking_fields(self) -> dict[str, str]:
         """Fields that the body does not have, each with the reason."""
-        turnover, same = self.remodeling.turnover, self.is_stress_free
+        same, processes = self.is_stress_free, self.remodeling.processes
         stress_free = (
             "the mesh is stress-free ([natural]): 'fibre_angle' is the angle in the unloaded body"
         )
         reasons: list[tuple[bool, Sequence[str], str]] = [
             (not self.regions, (REGION,), "the scene has no regions"),
             (same, (UNLOADED,), stress_free),
-            (same and not turnover.grows, (NATURAL_GRADIENT,), stress_free),
-            (
-                not turnover.is_on,
-                TURNED_OVER,
-                "it changes only with remodeling.turnover, which is not set",
-            ),
-            (
-                not turnover.grows,
-                (GROWTH,),
-                "tissue grows only with a remodeling.turnover.volume above 0",
-            ),
+            (same and not self.remodeling.growth_key, (NATURAL_GRADIENT,), stress_free),
+            (not processes, (*TURNED_OVER, GROWTH), "no process changes it"),
         ]
-        return {name: reason for lacks, names, reason in reasons if lacks for name in names}
+        lacking = {name: reason for lacks, names, reason in reasons if lacks for name in names}
+        return lacking | {name: why for one in processes for name, why in one.absent.items()}
 
     @property
     def has_free_length(self) -> bool:
@@ -587,11 +579,7 @@ class Scene(Table):
             _words(name) + properties.material.summary(loads)
             for name, properties in self.properties().items()
         ]
-        turnover = self.remodeling.turnover
-        if turnover.is_on:
-            parts.append(
-                f"turnover with rates = {turnover.rates!r} and volume = {turnover.volume:g}"
-            )
+        parts += [one.summary() for one in self.remodeling.processes if one.is_on]
         return "; ".join(parts)
 
     def warnings(self, wall: object = None) -> list[str]:
@@ -622,7 +610,7 @@ class Scene(Table):
         return [
             *warnings,
             *self.loaded_shape_warnings(),
-            *self._turnover_warnings(),
+            *self._process_warnings(),
             *self.remodeling.warnings(),
         ]
 
@@ -640,38 +628,18 @@ class Scene(Table):
                 f"in equilibrium, or {way}"
             )
         return [
-            "geometry.is = 'loaded': the shape belongs to all loads with the cells of t = 0. The "
-            f"cells reorient while and after the loads rise, so rows differ from it; {way}"
+            "geometry.is = 'loaded': it is the shape under all loads with the initial cells. The "
+            f"cells reorient while and after the loads rise, and the body leaves this shape; {way}"
         ]
 
-    def _turnover_warnings(self) -> Iterator[str]:
-        """Yield warnings on gains without stable or fast equilibrium, and on large steps."""
-        turnover, step = self.remodeling.turnover, self.time.step
-        if turnover.time is None:
-            return
-        for name, properties in self.properties().items():
-            power, slowly = turnover.rule.gain_and_recovery_time(properties.tissue)
-            says = f"{_words(name)}remodeling.turnover.gain = {turnover.gain:g}"
-            if power <= 2:
-                least = 2 * turnover.gain / power if turnover.gain else math.inf
-                yield (
-                    f"{says}: no stable homeostasis with this deposition_stretch; "
-                    f"must exceed {least:.3g}"
-                )
-            elif power < SLOW_REST:
-                words = "if collagen alone carries the loads, shorter with a matrix"
-                yield f"{says}: reaches equilibrium slowly, time constant {slowly:.3g} {words}"
-        chosen = self.time.is_equilibrium or self.time.tolerance is not None
-        if (
-            not chosen
-            and not COUPLINGS[self.remodeling.coupling].solves_cells
-            and step > turnover.time
-        ):
-            yield (
-                f"time.step = {step:g} exceeds remodeling.turnover.time = {turnover.time:g}: "
-                "content and natural length overshoot in each step; reduce time.step or set "
-                "time.tolerance"
-            )
+    def _process_warnings(self) -> Iterator[str]:
+        """Yield warnings on the additional processes that are on."""
+        chosen = self.time.is_equilibrium or self.time.is_adaptive
+        step = 0.0 if chosen or COUPLINGS[self.remodeling.coupling].solves_cells else self.time.step
+        for process in (one for one in self.remodeling.processes if one.is_on):
+            for name, properties in self.properties().items():
+                yield from (_words(name) + line for line in process.warnings(properties.tissue))
+            yield from filter(None, [process.step_warning(step)])
 
     def _values(self) -> dict[str, Any]:
         """Return all values, from which the same scene can be made."""

@@ -13,7 +13,7 @@ import math
 import re
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from typing import Annotated, Any, Literal, NamedTuple, NoReturn, Optional
+from typing import TYPE_CHECKING, Annotated, Any, Literal, NamedTuple, NoReturn, Optional
 
 import numpy as np
 from numpy.typing import NDArray
@@ -43,8 +43,10 @@ from remodel_fenicsx.model.axes import AXES, GROWTH, NATURAL_GRADIENT
 from remodel_fenicsx.model.chains import BOLTZMANN_CONSTANT, CHAINS
 from remodel_fenicsx.model.drivers import DRIVERS, FRAMES
 from remodel_fenicsx.model.energy import ELASTIN, MATRICES, Matrix, REPULSIONS, TURNED_OVER, Tissue
-from remodel_fenicsx.model.laws import LAWS, MEANS_OF_CASES, TURNOVER_RATES, TurnoverRule
+from remodel_fenicsx.model.laws import LAWS, MEANS_OF_CASES
 from remodel_fenicsx.model.spectral import PAIRINGS
+from remodel_fenicsx.schema import processes
+from remodel_fenicsx.schema.processes import ProcessTable
 from remodel_fenicsx.schema.tables import (
     Faults,
     IN_A_LIST,
@@ -52,6 +54,7 @@ from remodel_fenicsx.schema.tables import (
     OneOf,
     SceneError,
     Table,
+    extended_table,
     validation_error,
     join_names,
     quoted,
@@ -664,77 +667,7 @@ COUPLINGS = {
 
 
 EQUILIBRIUM = "equilibrium"
-"""Value of `time.end` that requests the homeostatic state without the history, and of
-`remodeling.turnover.from`."""
-
-_Start: Any = Annotated[
-    Annotated[float, Field(ge=0)] | Literal["equilibrium", "rest"],  # "rest": until version 0.4.0
-    AfterValidator(lambda start: EQUILIBRIUM if start == "rest" else start),
-]
-_WithStart: Any = with_key(
-    "from",
-    Annotated[Any, GetPydanticSchema(lambda _, handler: handler(_Start))],
-    default=0.0,
-    json_schema_extra={"allowed": "a finite number of at least 0, or 'equilibrium'"},
-    description="Time from which turnover adds volume; a step ends there. 0: always. "
-    "'equilibrium', with time.end = 'equilibrium': from the steady state under the loads before "
-    "their last change. The older name 'rest' means the same.",
-)
-
-
-class Turnover(_WithStart):  # type: ignore[misc]
-    """Removal and deposition of collagen, if `time` is set (docs/tissue_that_lives.md).
-
-    For the law `tensor`.
-    """
-
-    time: float | None = Field(default=None, gt=0)
-    """Turnover time T of collagen. Without it there is no turnover."""
-    deposition_stretch: float = Field(default=1.1, gt=1)
-    """Deposition stretch lambda_h of new chains, over r0."""
-    gain: float = Field(default=1.0, ge=0)
-    """Gain k: how fast the amount of collagen follows the stress of the chains. With 0 the amount
-    is constant."""
-    rates: Annotated[str, OneOf(TURNOVER_RATES)] = "cauchy"
-    """Stimulus of amount and natural length. 'cauchy': the stress of a chain. 'tension': its force,
-    as in version 0.3.0."""
-    volume: float = Field(default=0.3, ge=0, le=1)
-    """Volume fraction phi of collagen in the wall at the start, or at `from`. Deposited collagen
-    adds volume unless this is 0."""
-    growth: Literal["normal"] = "normal"
-    """Direction of growth. 'normal': across the wall."""
-
-    @property
-    def grows(self) -> bool:
-        """Whether deposited collagen adds volume."""
-        return self.is_on and self.volume > 0
-
-    @property
-    def starts_at_rest(self) -> bool:
-        """Whether growth starts from a homeostatic state on the load path."""
-        return bool(getattr(self, "from") == EQUILIBRIUM)
-
-    @property
-    def start(self) -> float:
-        """Time from which turnover adds volume; infinite if that is an equilibrium."""
-        return math.inf if self.starts_at_rest else float(getattr(self, "from"))
-
-    @property
-    def rule(self) -> TurnoverRule:
-        """Turnover rule as a function of arrays."""
-        assert self.time is not None
-        return TurnoverRule(
-            self.time, self.deposition_stretch, self.gain, TURNOVER_RATES[self.rates]
-        )
-
-    @property
-    def is_on(self) -> bool:
-        """Whether the scene has turnover."""
-        return self.time is not None
-
-    def _faults(self) -> Faults:
-        if self.time is None and self != Turnover.model_construct():
-            yield "missing; turnover needs its time", "time", None
+"""Value of `time.end` that requests the homeostatic state without the history."""
 
 
 @dataclass(frozen=True)
@@ -767,7 +700,7 @@ class RemodelsKind:
         return resolved(self.part)
 
 
-REMODELS = {"turnover": RemodelsKind(Turnover, "remodel_fenicsx.evolution.turnover:TurnoverPass")}
+REMODELS = {name: RemodelsKind(table, table.process) for name, table in processes.tables().items()}
 """Quantities that remodel in addition to the cells, by the name of their `[remodeling]` table."""
 
 
@@ -838,8 +771,6 @@ class Remodeling(Table):
     """For the law 'rotation': a small angle between fibre and tension decays as exp(-t /
     rotation_time)."""
 
-    turnover: Turnover = Turnover()
-
     def warnings(self) -> list[str]:
         """Return a warning if the coupling relaxes a law and thereby slows it down."""
         law, share = LAWS[self.law], self.relaxation_factor
@@ -856,13 +787,25 @@ class Remodeling(Table):
         ]
 
     @property
-    def beside(self) -> list[RemodelsKind]:
+    def additional_kinds(self) -> list[RemodelsKind]:
         """Registry entries of the quantities that remodel in addition to the cells."""
         return [
             kind
             for name, kind in REMODELS.items()
             if (table := getattr(self, name, None)) and table.is_on
         ]
+
+    @property
+    def processes(self) -> list[ProcessTable]:
+        """Tables of the processes in addition to the cells, also of inactive ones."""
+        tables = (getattr(self, name, None) for name in REMODELS)
+        return [table for table in tables if isinstance(table, ProcessTable)]
+
+    @property
+    def growth_key(self) -> str:
+        """Dotted key with which the tissue grows; empty if its volume is constant."""
+        growing = (process for process in self.processes if process.growth_key)
+        return next((f"remodeling.{process.name}.{process.growth_key}" for process in growing), "")
 
     @property
     def own_parameters(self) -> dict[str, float]:
@@ -896,14 +839,21 @@ class Remodeling(Table):
             drivers = join_names(DRIVERS, lambda driver: driver.is_stress)
             rule = f"must be 0 unless remodeling.driver is a stress: {drivers}"
             yield rule, "threshold", self.threshold
-        if self.turnover.is_on and not law.uses_exponent_and_threshold:
-            yield f"needs remodeling.law = {able}", "turnover", None
-        if self.turnover.is_on and not coupling.takes_turnover:
-            able = join_names(COUPLINGS, lambda kind: kind.takes_turnover)
-            yield f"must be one of {able} with remodeling.turnover", "coupling", self.coupling
+        for name in (process.name for process in self.processes if process.is_on):
+            if not law.uses_exponent_and_threshold:
+                yield f"needs remodeling.law = {able}", name, None
+            if not coupling.takes_turnover:
+                names = join_names(COUPLINGS, lambda kind: kind.takes_turnover)
+                yield f"must be one of {names} with remodeling.{name}", "coupling", self.coupling
         if coupling.needs_a_target and law.target is None:
             rule = "needs a remodeling.law with a target that can be extrapolated"
             yield f"{rule}: {laws_with_a_target()}", "coupling", self.coupling
+
+
+if not TYPE_CHECKING:  # the tables of processes are keys of the table too
+    Remodeling = extended_table(
+        Remodeling, tuple((name, kind.table) for name, kind in REMODELS.items())
+    )
 
 
 def laws_with_a_target() -> str:
@@ -1284,8 +1234,6 @@ FIELDS_BY_NAME = (
 )
 """Names for `output.fields` (`results.fields`); "chains" are the lines of fields_chains.vtkhdf."""
 REGION = "region"  # field of bodies with regions
-TURNOVER_POWER = "turnover_power"  # column of bodies with turnover, next to means of its fields
-GROWTH_COLUMNS = (GROWTH, "collagen_share")  # columns of bodies whose volume changes with turnover
 UNLOADED = "fibre_angle_unloaded"  # field of bodies whose mesh is not stress-free
 NO_PRESTRETCH = (UNLOADED, NATURAL_GRADIENT)  # fields that bodies with a stress-free mesh lack
 CONSTANT_FIELDS = ("axis_c", "axis_a", "axis_r", "depth", "station")

@@ -284,7 +284,7 @@ class KeysOfParts(Before):
         }
         if not own:
             return value
-        wide = _extended_table(table, tuple(own.items()), self.optional)
+        wide = extended_table(table, tuple(own.items()), self.optional)
         try:
             return wide.model_validate(dict(value))
         except ValidationError as error:
@@ -295,7 +295,7 @@ Own = tuple[tuple[str, OwnNumber | type[Table]], ...]
 
 
 @functools.cache
-def _extended_table(table: type[Table], own: Own, optional: bool) -> type[Table]:
+def extended_table(table: type[Table], own: Own, optional: bool = False) -> type[Table]:
     """Create a table with further numbers and tables, cached so that such scenes compare equal."""
     kind = float | None if optional else float
     fields: dict[str, Any] = {
@@ -311,7 +311,13 @@ def _extended_table(table: type[Table], own: Own, optional: bool) -> type[Table]
         if not isinstance(number, type)
     }
     fields |= {name: (inner, inner()) for name, inner in own if isinstance(inner, type)}
-    return create_model(table.__name__, __base__=table, __doc__=table.__doc__, **fields)
+    return create_model(
+        table.__name__,
+        __base__=table,
+        __doc__=table.__doc__,
+        __module__=table.__module__,
+        **fields,
+    )
 
 
 def validation_error(rule: str, key: str = "", value: object = _MISSING) -> PydanticCustomError:

@@ -3,12 +3,9 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable
-from typing import NamedTuple, TypeVar
+from typing import NamedTuple
 
 log = logging.getLogger(__name__)
-T = TypeVar("T")
-F = TypeVar("F", bound=Exception)
 
 
 class Attempt(NamedTuple):
@@ -21,36 +18,29 @@ class Attempt(NamedTuple):
     message: str = ""
 
 
-FROM_EXPECTED = Attempt(
+FROM_PREDICTION = Attempt(
     "from the displacement predicted by the last steps",
     "Staggered",
     "Newton failed from the predicted displacement ({reason}); using the last one",
 )
-FROM_LAST = Attempt("from the last displacement", "Staggered", "{reason}; solving in substeps")
-MADE_ANEW = Attempt(
+FROM_PREVIOUS = Attempt("from the last displacement", "Staggered", "{reason}; solving in substeps")
+WITH_FALLBACK = Attempt(
     "in each solve: again, with a new factorisation in every iteration, or instead of multigrid",
     "FullNewton.fallback",
     "Newton failed ({reason}); retrying {how}",
 )
-IN_PARTS = Attempt(
-    "in substeps: first the remodeled cells, then the loads; a failed substep is halved", "Change"
+IN_SUBSTEPS = Attempt(
+    "in substeps: first the remodeled cells, then the loads; a failed substep is halved",
+    "Continuation",
 )
-STEP_REFUSED = Attempt("the step fails, with its cause and advice", "diagnose_failure")
+STEP_FAILS = Attempt("the step fails, with its cause and advice", "diagnose_failure")
 SHORTER_STEP = Attempt(
     "with time.tolerance: a quarter of the step size, up to three times",
     "StepControl",
     "{reason}; retrying with a smaller step",
 )
-ATTEMPTS = (FROM_EXPECTED, FROM_LAST, MADE_ANEW, IN_PARTS, STEP_REFUSED, SHORTER_STEP)
+ATTEMPTS = (FROM_PREDICTION, FROM_PREVIOUS, WITH_FALLBACK, IN_SUBSTEPS, STEP_FAILS, SHORTER_STEP)
 """Attempts in their order; docs/architecture.md has the table."""
-
-
-def attempted(solve: Callable[[], T], *failures: type[F]) -> T | F:
-    """Return the result of a solve, or its failure."""
-    try:
-        return solve()
-    except failures as failed:
-        return failed
 
 
 def say(attempt: Attempt, reason: object, how: str = "") -> None:

@@ -20,7 +20,6 @@ from remodel_fenicsx.model.cells import UnitCell
 from remodel_fenicsx.model.chains import UflOrArray
 from remodel_fenicsx.model.energy import Tissue
 from remodel_fenicsx.schema.settings import Solver
-from remodel_fenicsx.solver.attempts import attempted
 from remodel_fenicsx.solver.equilibrium import Equilibrium, StateLimits
 from remodel_fenicsx.solver.newton import (
     POSSIBLE_JUMP,
@@ -28,6 +27,7 @@ from remodel_fenicsx.solver.newton import (
     GuardedNewton,
     Solution,
     SolveFailure,
+    attempted,
 )
 from remodel_fenicsx.solver.diagnosis import (
     BIFURCATION,
@@ -36,7 +36,7 @@ from remodel_fenicsx.solver.diagnosis import (
     FailureCause,
     diagnose_failure,
 )
-from remodel_fenicsx.state import StateNumbers, State
+from remodel_fenicsx.state import State
 
 log = logging.getLogger(__name__)
 
@@ -63,6 +63,8 @@ MIN_HALVINGS_FOR_JUMP = (
 # Number of jumps in a run that are checked, each by about 25 solves. A body that collapses jumps in
 # every step.
 MOST_JUMPS = 3
+# Numbers of the state: jumps in the run so far, and largest change of an unknown in the last step.
+JUMPS_SO_FAR, LAST_CHANGE = "jumps_found", "jumps_moved"
 KEPT_RESERVE = 0.2  # fraction of 1 - r/L that a remodeling substep leaves at every point
 
 
@@ -73,14 +75,14 @@ class Work(SolverCounts):
     substeps: int = 0
     residual: float = 0.0  # of the last solution, in the unit of force
     # Of the last solution, if evaluated with the cells of the row.
-    extension: StateLimits | None = None
+    limits: StateLimits | None = None
     last: Solution | None = None
 
     def add(self, done: Solution | SolveFailure | Work) -> None:
         """Add the work of a solve, or of a rejected step."""
         self.count(done)
         if isinstance(done, Solution):
-            self.residual, self.extension = done.residual, done.extension
+            self.residual, self.limits = done.residual, done.limits
             self.last = done
 
 
@@ -144,11 +146,11 @@ class StepFailure(RemodelError, RuntimeError):
 
 def failure_text(time: float, stage: str, fraction: float, cause: SolveFailure) -> str:
     """Return the message of a change that stops at a fraction of the step, with its cause."""
-    point = ", ".join(f"{c:.3f}" for c in cause.extension.worst_point)
+    point = ", ".join(f"{c:.3f}" for c in cause.limits.worst_point)
     return (
         f"no equilibrium at time {time:g}: {stage} failed at {100 * fraction:.3g} % of the step "
-        f"({cause.reason}; largest r/L = {cause.extension.max_chain_extension:.4f} at ({point}), "
-        f"smallest J = {cause.extension.min_jacobian:.4g})"
+        f"({cause.reason}; largest r/L = {cause.limits.max_chain_extension:.4f} at ({point}), "
+        f"smallest J = {cause.limits.min_jacobian:.4g})"
     )
 
 
@@ -162,7 +164,7 @@ class Continuation:
     state: State
     solves: Callable[[], GuardedNewton]  # called for substeps only, which few steps need
     maximum_halvings: int
-    largest_part: Callable[[float], float] = lambda done: 1.0
+    largest_increment: Callable[[float], float] = lambda done: 1.0
     loose_tolerance: bool = False
     refusal: FailureCause | None = field(default=None, init=False)  # cause of a jump in the change
     # Rate of the unknowns in the last substep.
@@ -189,7 +191,7 @@ class Continuation:
                 f"attempt {attempts}: {100 * part:.2g} %"
             )
             before = vector.array.copy()
-            part = min(part, 1.0 - done, self.largest_part(done))
+            part = min(part, 1.0 - done, self.largest_increment(done))
             is_last = done + part > 1.0 - 1e-12
             self.set_fraction(1.0 if is_last else done + part)
             solution = attempted(
@@ -227,8 +229,8 @@ class Continuation:
     def check_for_jump(self, before: NDArray[np.float64], work: Work, again: bool) -> bool:
         """Repeat a step in substeps if it may have jumped. Return True if so. Collective."""
         # `again`: the same step was solved before, with other cells.
-        vector, jumps = self.state.unknown.x, self._jumps
-        moved, last = self._size(vector.array - before), jumps["moved"]
+        vector, last = self.state.unknown.x, self.state.numbers.get(LAST_CHANGE, 0.0)
+        moved = self._size(vector.array - before)
         tangents, expected = work.tangents if work.substeps == 1 else 0, 0.0 if again else last
         looked = (
             self.is_another_branch(work.last, moved, expected, tangents) and self._may_check_jumps()
@@ -236,7 +238,7 @@ class Continuation:
         if looked:
             self.repeat_in_substeps(before, work)
             moved = self._size(vector.array - before)
-        jumps["moved"] = max(moved, last) if again else moved
+        self.state.numbers[LAST_CHANGE] = max(moved, last) if again else moved
         return looked
 
     def repeat_in_substeps(self, before: NDArray[np.float64], work: Work) -> None:
@@ -265,7 +267,7 @@ class Continuation:
             log.info(
                 "time %g: several solutions exist; using the one reached by substeps", self.time
             )
-            work.residual, work.extension = parts.residual, parts.extension
+            work.residual, work.limits = parts.residual, parts.limits
             work.substeps = parts.substeps
             return
         unknown[:] = solution
@@ -298,17 +300,14 @@ class Continuation:
     def _may_check_jumps(self) -> bool:
         """Return whether a possible jump is checked."""
         enough = self.maximum_halvings >= MIN_HALVINGS_FOR_JUMP
-        return enough and self.refusal is None and self._jumps["found"] < MOST_JUMPS
-
-    @property
-    def _jumps(self) -> StateNumbers:
-        return StateNumbers(self.state, "jumps", {"found": 0, "moved": 0})
+        jumps = self.state.numbers.get(JUMPS_SO_FAR, 0.0)
+        return enough and self.refusal is None and jumps < MOST_JUMPS
 
     def _warn_of_jump(self, solved: NDArray[np.float64], refusal: FailureCause) -> None:
         """Warn of a jump from the end of a branch, the present state, to `solved`. Collective."""
         self.refusal = refusal
-        self._jumps["found"] += 1
         state, vector = self.state, self.state.unknown.x
+        state.numbers[JUMPS_SO_FAR] = state.numbers.get(JUMPS_SO_FAR, 0.0) + 1.0
         far = self._size(solved - vector.array)
         if state.comm.rank == 0:
             loads = ", ".join(
@@ -372,11 +371,11 @@ class CellHomotopy:
         """Set theta to this fraction."""
         self.theta.value = fraction
 
-    def largest_part(self, done: float) -> float:
+    def largest_increment(self, done: float) -> float:
         """Return the largest increment of theta that keeps KEPT_RESERVE of 1 - r/L everywhere."""
         # r^2 is linear in theta at a frozen deformation, so the bound is in closed form.
         equilibrium, quadrature = self.equilibrium, self.equilibrium.quadrature
-        length = quadrature.owned(equilibrium.locking_length())
+        length = quadrature.owned(equilibrium.parameters.locking_length())
         self.theta.value = done
         now = quadrature.owned(equilibrium.squared_lengths())
         self.theta.value = 1.0

@@ -236,9 +236,9 @@ def inertia_without_loads(inertia: Inertia) -> tuple[int, float]:
 NEARLY_LOCKED = 0.98  # r/L of locking chains under a prescribed motion
 LOCKED = 0.999  # r/L of locking chains under any load
 COLLAPSED_JACOBIAN = 0.02  # J of collapsed elements
-NEARLY_CRITICAL = 0.1  # lowest eigenvalue over its unloaded value
+NEARLY_CRITICAL = 0.1  # lowest eigenvalue, relative to that of the unloaded body
 ALONG_THE_MODE = 0.5  # cosine between the last change of the displacement and the mode
-NEARLY_SOLVED = 1e3  # largest residual over tolerance that is attributed to the tolerance
+NEARLY_SOLVED = 1e3  # largest residual / tolerance that is attributed to the tolerance
 MAX_ADVISED_TOLERANCE = 1e-4  # largest relative_tolerance that a message recommends
 
 
@@ -300,19 +300,19 @@ def diagnose_failure(
     direction: NDArray[np.float64] | None = None,
 ) -> FailureCause:
     """Return the cause of a failure, from the last solved state. Collective."""
-    extension = newton.equilibrium.extension()
-    if not extension.admissible:
+    limits = newton.equilibrium.limits()
+    if not limits.admissible:
         return TOO_LARGE
-    longest, prescribed = extension.max_chain_extension, newton.equilibrium.prescribed_values()
+    longest, prescribed = limits.max_chain_extension, newton.equilibrium.prescribed_values()
     moved = newton.equilibrium.comm.allreduce(bool(np.any(np.nan_to_num(prescribed))), MPI.LOR)
     if longest > (NEARLY_LOCKED if moved else LOCKED):
-        place = ", ".join(f"{c:.4g}" for c in extension.worst_point)
+        place = ", ".join(f"{c:.4g}" for c in limits.worst_point)
         return replace(
             CHAIN_LOCKING, finding=f"r/L = {longest:.6g} at ({place}) in the last solved state"
         )
-    if extension.min_jacobian < COLLAPSED_JACOBIAN:
+    if limits.min_jacobian < COLLAPSED_JACOBIAN:
         return replace(
-            KINEMATIC_LOCKING, finding=f"J = {extension.min_jacobian:.3g} in the last solved state"
+            KINEMATIC_LOCKING, finding=f"J = {limits.min_jacobian:.3g} in the last solved state"
         )
     inertia = Inertia(newton.equilibrium)
     try:

@@ -140,7 +140,8 @@ class PointStresses:
 
     def refresh(self) -> None:
         """Update what the expressions need in addition to F from the present unknowns and cells."""
-        self._dilatation.refresh()
+        if self._dilatation.jacobian is not None:
+            self._dilatation.refresh()
         if self._repulsion is not None:
             self._repulsion.update()
 
@@ -179,7 +180,7 @@ class StateLimits:
 class PointState(NamedTuple):
     """State at this rank's own points: limits; r/L and J, (elements, points); F, (n, 3, 3)."""
 
-    extension: StateLimits
+    limits: StateLimits
     stretches: Array
     jacobians: Array
     gradients: Array
@@ -229,30 +230,30 @@ class Equilibrium:
         self._energy_forms: list[dolfinx.fem.Form] = []
 
     # ------------------------------------------------------------ state and limits
-    def extension(self) -> StateLimits:
+    def limits(self) -> StateLimits:
         """Return largest r/L and smallest J of the present unknowns over all ranks. Collective."""
-        return self.evaluate().extension
+        return self.evaluate().limits
 
     def evaluate(self) -> PointState:
         """Return limits, r/L, J and F of the present unknowns, cached for a state. Collective."""
         look = self._known(self._look)
-        if look.extension.stop_signal:
+        if look.limits.stop_signal:
             self._known.forget()  # the stop request may be withdrawn
         return look
 
     def _look(self) -> PointState:
         quadrature = self.quadrature
         squares, lengths = quadrature.owned(self.squared_lengths()), quadrature.owned(
-            self.locking_length()
+            self.parameters.locking_length()
         )
         gradients = self.state.elastic_gradient()[: squares.size]
         jacobians = det(gradients).reshape(squares.shape)
         with np.errstate(invalid="ignore"):
             stretches = np.sqrt(squares) / lengths
         stretches[~np.isfinite(stretches)] = np.inf
-        smallest = min(
-            map(_smallest, (jacobians, quadrature.owned(self.state.dilatation.jacobians())))
-        )
+        smallest, dilatation = _smallest(jacobians), self.state.dilatation
+        if dilatation.jacobian is not None:
+            smallest = min(smallest, _smallest(quadrature.owned(dilatation.jacobians())))
         local: tuple[float, tuple[float, ...]] = (-np.inf, (np.nan,) * 3)
         if stretches.size:
             worst = int(np.argmax(stretches))
@@ -260,11 +261,12 @@ class Equilibrium:
                 quadrature.coordinates.reshape(-1, 3)[worst].tolist()
             )
         ranks = allgather(self.comm, (*local, smallest, self.state.stop_signal()))
-        largest, worst_point, _, _ = max(ranks, key=lambda rank: rank[0])
-        extension = StateLimits(
-            largest, min(rank[2] for rank in ranks), worst_point, max(rank[3] for rank in ranks)
+        extensions, positions, jacobians_of_ranks, signals = zip(*ranks, strict=True)
+        worst_rank = int(np.argmax(extensions))
+        limits = StateLimits(
+            extensions[worst_rank], min(jacobians_of_ranks), positions[worst_rank], max(signals)
         )
-        return PointState(extension, stretches, jacobians, gradients)
+        return PointState(limits, stretches, jacobians, gradients)
 
     def keeps_margin(
         self,
@@ -291,7 +293,7 @@ class Equilibrium:
     def safe_change(self, far: float) -> float:
         """Return the largest |dF| with J > 0 and r/L < `far` at all points. Collective."""
         look, lengths = self.evaluate(), self.state.cells.dimension_values
-        chains = np.sqrt((lengths**2).sum(axis=-1)) / self.locking_length()
+        chains = np.sqrt((lengths**2).sum(axis=-1)) / self.parameters.locking_length()
         volume = (
             2.0 * look.jacobians.ravel() / np.einsum("nij,nij->n", look.gradients, look.gradients)
         )
@@ -309,10 +311,6 @@ class Equilibrium:
         if self._point_shares is None:
             return cells.kernels.squared_length(F, cells.point_cells).reshape(shape)
         return np.asarray(squared_end_to_end_length(F, self._point_shares())).reshape(shape)
-
-    def locking_length(self) -> NDArray[np.float64]:
-        """Return the locking length of chains, (elements, points); infinite if no chain locks."""
-        return self.parameters.locking_length()
 
     def stored_energy(self) -> float:
         """Return the integral of W over the body. Collective."""

@@ -3,7 +3,10 @@
 from __future__ import annotations
 
 import logging
+from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
+from typing import TypeVar
 
 import dolfinx.fem.petsc
 import numpy as np
@@ -22,7 +25,7 @@ from remodel_fenicsx.fem.solver_methods import (
     method_options,
 )
 from remodel_fenicsx.schema.settings import Solver
-from remodel_fenicsx.solver.attempts import MADE_ANEW, attempted, say
+from remodel_fenicsx.solver.attempts import WITH_FALLBACK, say
 from remodel_fenicsx.solver.equilibrium import Equilibrium, StateLimits, PointState
 from remodel_fenicsx.solver.linear import FullNewton, cheaper_method, takes_levels
 from remodel_fenicsx.state import stress_rounding
@@ -30,12 +33,14 @@ from remodel_fenicsx.system.interrupts import Interrupted
 
 log = logging.getLogger(__name__)
 Array = NDArray[np.float64]
+T = TypeVar("T")
+F = TypeVar("F", bound=Exception)
 
 
 # ---------------------------------------------------------------- convergence
 # The residual must not exceed a tolerance. The tolerance is at least the rounding error.
 
-FORCE_ROUNDINGS = 8.0  # accepted residual over the rounding error of assembled forces
+FORCE_ROUNDINGS = 8.0  # accepted residual as a multiple of the rounding error of assembled forces
 # Accepted residual as a multiple of the force of rounded displacements, whose strain is eps |u|/h.
 # On thin and on stiff walls 0.07 to 4 was measured.
 ROUNDED_STRAINS = 8.0
@@ -44,20 +49,20 @@ ROUNDED_STRAINS = 8.0
 PRESCRIBED_TOLERANCE = 1e-10
 # Error of prescribed values up to rounding, relative to the body's size.
 PRESCRIBED_ROUNDING = 1e-13
-# Residual of all substeps but the last, relative to the nodal forces. A substep may be 1/256 of a
-# step. Jump detection compares each substep with the direction of the one before. With 1e-3 the
+# Residual of all substeps but the last, relative to the nodal forces. Jump detection compares the
+# directions of successive substeps, which may be as short as 1/256 of a step. With 1e-3 the
 # quasi-Newton solver stopped too early, and some substeps were mistaken for jumps.
 INTERMEDIATE_TOLERANCE = 1e-5
 NEARLY_STRAIGHT = 0.99  # r/L above which the rounding error of one point may dominate
 COARSE = 1e-8  # tolerance / nodal forces; above this, the rounding error of one point dominates
-# Residual over the previous one above which Newton's method stagnates. Only then
-# is a residual accepted because of rounding errors of displacements, and, with nearly straight
-# chains, because of any rounding errors.
+# Ratio of two successive residuals above which Newton's method stagnates. Only then is a residual
+# accepted because of rounding errors of displacements, and, with nearly straight chains, because of
+# any rounding errors.
 STAGNATION = 0.25
 
 
 class Convergence:
-    """Test of |R| <= absolute_tolerance + relative_tolerance |nodal forces|, or rounding errors."""
+    """Test of |R| <= absolute_tolerance + relative_tolerance |nodal forces|, or rounding error."""
 
     def __init__(self, equilibrium: Equilibrium, settings: Solver):
         self.equilibrium, self.settings = equilibrium, settings
@@ -99,8 +104,8 @@ class Convergence:
         coarse = (
             self.max_chain_extension > NEARLY_STRAIGHT and tolerance > COARSE * self.force_scale
         )
-        accepted_at_once = requested if coarse else self.tolerance(rounded_strains=0.0)
-        return norm <= accepted_at_once or norm > STAGNATION * previous
+        always_accepted = requested if coarse else self.tolerance(rounded_strains=0.0)
+        return norm <= always_accepted or norm > STAGNATION * previous
 
     def goal(self) -> float:
         """Return the approximate norm of the residual at which the solve ends."""
@@ -125,7 +130,7 @@ class Convergence:
 # Where a Newton step ends with r/L above NEAR_LIMIT, the point must keep at least the fraction
 # RESERVE of the 1 - r/L that it had before the step.
 NEAR_LIMIT, RESERVE = 0.95, 0.3
-NOWHERE = StateLimits(0.0, 1.0, (np.nan,) * 3)
+NOT_EVALUATED = StateLimits(0.0, 1.0, (np.nan,) * 3)
 LINE_SEARCH_HALVINGS = 20  # number of halvings of a Newton step before the line search fails
 # Number of Newton steps in a row, and of halvings of each, after which a solve fails. Solves that
 # succeed have at most two such steps; on a thin wall under too much load all steps are as short.
@@ -155,7 +160,7 @@ class Solution(SolverCounts):
     """Result of a successful solve."""
 
     residual: float = 0.0
-    extension: StateLimits = NOWHERE
+    limits: StateLimits = NOT_EVALUATED
     # |solution - start of the step| / |first iterate - start of the step|, by which jumps are
     # detected; 0 for small distances.
     displacement_ratio: float = 0.0
@@ -173,10 +178,18 @@ class SolveFailure(RuntimeError, SolverCounts):
         stagnates: bool = False,
     ):
         super().__init__(reason)
-        self.reason, self.extension = reason, solution.extension
+        self.reason, self.limits = reason, solution.limits
         self.stagnates, self.relative_residual = stagnates, relative_residual
         self.residual_over_tolerance = residual_over_tolerance
         self.count(solution)
+
+
+def attempted(solve: Callable[[], T], *failures: type[F]) -> T | F:
+    """Return the result of a solve, or its failure."""
+    try:
+        return solve()
+    except failures as failed:
+        return failed
 
 
 @dataclass
@@ -190,7 +203,7 @@ class _Solve:
     inadmissible: bool = False
     # All states whose |dF| from the last evaluated state is below this are admissible.
     safe_change: float = 0.0
-    is_certain: bool = False  # whether safe_change shows that the state is admissible
+    is_known_admissible: bool = False  # without an evaluation, because |dF| is below safe_change
     short_steps: int = 0  # number of Newton steps in a row that the guards have made very short
 
 
@@ -205,12 +218,10 @@ SNES_REASONS = {
 DIVERGED_MAX_IT = -5
 
 
-def failure_text(reason: int, iterations: int, extension: StateLimits) -> str:
+def failure_text(reason: int, iterations: int, limits: StateLimits) -> str:
     """Return why a solve has failed; if SNES has converged, that its state is not admissible."""
     if reason >= 0:
-        return (
-            f"reached r/L = {extension.max_chain_extension:.4f}, J = {extension.min_jacobian:.4g}"
-        )
+        return f"reached r/L = {limits.max_chain_extension:.4f}, J = {limits.min_jacobian:.4g}"
     if reason == DIVERGED_MAX_IT:
         return f"no equilibrium within {iterations} Newton iterations"
     return SNES_REASONS.get(reason, f"SNES stopped with reason {reason}")
@@ -258,7 +269,7 @@ class GuardedNewton:
         snes: PETSc.SNES = PETSc.SNES().create(equilibrium.comm)
         snes.setFunction(self._assemble_residual, self._residual)
         snes.setJacobian(
-            lambda *_: self._linear.tangent(self._present.norm, self.convergence.goal()),
+            lambda *_: self.linear.tangent(self._present.norm, self.convergence.goal()),
             self._matrix,
         )
         snes.setLineSearchPreCheck(self._keep_admissible)
@@ -268,17 +279,17 @@ class GuardedNewton:
         self._most_iterations = snes.getTolerances()[3]
         snes.setConvergenceTest(self._converged)
         self._snes: PETSc.SNES = snes
-        self._linear: FullNewton = SOLVER_METHODS[method].make_linear(
+        self.linear: FullNewton = SOLVER_METHODS[method].make_linear(
             equilibrium, snes, self._matrix, self._options
         )
         if self._robust:
-            self._linear.disable_reuse()
+            self.linear.disable_reuse()
 
     def close(self) -> None:
         """Free PETSc's objects and options. Further calls have no effect."""
         if self._snes is None:
             return
-        self._linear.close()
+        self.linear.close()
         self._snes.destroy()
         self._options.close()
         for thing in (self._matrix, self._x, self._residual, self._external, self._trial):
@@ -293,17 +304,17 @@ class GuardedNewton:
         """
         self.convergence.intermediate = loose_tolerance
         first = attempted(
-            lambda: self._attempt(step_start, self._linear.iteration_factor), SolveFailure
+            partial(self._attempt, step_start, self.linear.iteration_factor), SolveFailure
         )
         if isinstance(first, Solution):
             return first
-        second = None if self._present.short_steps >= SHORT_STEPS else self._linear.fallback()
+        second = None if self._present.short_steps >= SHORT_STEPS else self.linear.fallback()
         if second is None:
             raise first
-        words, other_way = second
-        say(MADE_ANEW, first.reason, words)
-        with other_way:
-            again = attempted(lambda: self._attempt(step_start), SolveFailure)
+        description, fallback = second
+        say(WITH_FALLBACK, first.reason, description)
+        with fallback:
+            again = attempted(partial(self._attempt, step_start), SolveFailure)
         again.count(first)
         if isinstance(again, SolveFailure):
             raise again
@@ -311,38 +322,39 @@ class GuardedNewton:
 
     def is_admissible_start(self, last_extension: float) -> bool:
         """Return whether a solve may start here: admissible, and not too near to r = L."""
-        extension, least = self.equilibrium.extension(), RESERVE * (1 - last_extension)
-        near = (
-            extension.max_chain_extension > NEAR_LIMIT and 1 - extension.max_chain_extension < least
-        )
-        return extension.admissible and not near
+        limits, least = self.equilibrium.limits(), RESERVE * (1 - last_extension)
+        near = limits.max_chain_extension > NEAR_LIMIT and 1 - limits.max_chain_extension < least
+        return limits.admissible and not near
 
     def _attempt(self, step_start: Array | None, iteration_factor: int = 1) -> Solution:
-        start, tangents = self._values.copy(), self._linear.tangents
+        start, tangents = self._values.copy(), self.linear.tangents
         self._snes.setTolerances(max_it=iteration_factor * self._most_iterations)
         self.convergence.begin()
         self._to_petsc(self._x)
         self._present = _Solve(start if step_start is None else step_start)
-        self._linear.begin()
+        self.linear.begin()
         self._snes.solve(None, self._x)
-        self._warn_of_unused_options()
+        if not self._options_checked:
+            self._warn_of_unused_options()
         reason = self._snes.getConvergedReason()
         self._from_petsc(self._x)
-        extension, norm = self.equilibrium.extension(), float(self._snes.getFunctionNorm())
+        limits, norm = self.equilibrium.limits(), float(self._snes.getFunctionNorm())
         newton, linear = self._snes.getIterationNumber(), self._snes.getLinearSolveIterations()
-        solution = Solution(newton, linear, self._linear.tangents - tangents, norm, extension)
-        if reason >= 0 and not self._present.inadmissible and extension.admissible:
-            self._linear.ended(newton)
+        solution = Solution(newton, linear, self.linear.tangents - tangents, norm, limits)
+        if reason >= 0 and not self._present.inadmissible and limits.admissible:
+            self.linear.ended(newton)
             solution.displacement_ratio = self._displacement_ratio()
             return solution
         self._values[:] = start
-        if extension.stop_signal:
-            raise Interrupted(extension.stop_signal)
-        text = failure_text(0 if self._present.inadmissible else reason, newton, extension)
+        if limits.stop_signal:
+            raise Interrupted(limits.stop_signal)
+        text = failure_text(0 if self._present.inadmissible else reason, newton, limits)
         scales = self.convergence.tolerance(), self.convergence.force_scale
-        left, relative = (norm / max(scale, float(np.finfo(np.float64).tiny)) for scale in scales)
+        over_tolerance, relative = (
+            norm / max(scale, float(np.finfo(np.float64).tiny)) for scale in scales
+        )
         raise SolveFailure(
-            text, solution, left, relative, norm > STAGNATION * self._present.previous
+            text, solution, over_tolerance, relative, norm > STAGNATION * self._present.previous
         )
 
     def _displacement_ratio(self) -> float:
@@ -371,8 +383,8 @@ class GuardedNewton:
         dolfinx.fem.petsc.set_bc(
             self._residual, equilibrium.state.loading.boundary_conditions, self._x, -1.0
         )
-        if not (self._linear.tangents if self._linear.reuses_factorisation else tangents):
-            self._linear.renew()
+        if not (self.linear.tangents if self.linear.reuses_factorisation else tangents):
+            self.linear.renew()
         solver, direction = self._snes.getKSP(), self._x.duplicate()
         solver.setOperators(self._matrix)
         solver.solve(self._residual, direction)
@@ -382,14 +394,8 @@ class GuardedNewton:
         direction.destroy()
         return values
 
-    def factorisation(self) -> PETSc.PC | None:
-        """Return PETSc's preconditioner with the last factorisation, or None without one."""
-        return self._linear.factorisation()
-
     def _warn_of_unused_options(self) -> None:
-        """Warn of unused PETSc options, once, after the first solve. Collective."""
-        if self._options_checked:
-            return
+        """Warn of unused PETSc options after the first solve. Collective."""
         self._options_checked = True
         unused = self._options.unused()
         if unused and self.equilibrium.comm.rank == 0:
@@ -429,15 +435,15 @@ class GuardedNewton:
             residual.axpy(1.0, self._external)
         dolfinx.fem.petsc.set_bc(residual, loading.boundary_conditions, x, -1.0)
         present = self._present
-        if present.is_certain:
+        if present.is_known_admissible:
             present.inadmissible = (
                 allreduce(equilibrium.comm, equilibrium.state.stop_signal(), MPI.MAX) > 0
             )
         else:
-            extension = equilibrium.extension()
-            present.inadmissible = not extension.admissible or extension.stop_signal > 0
+            limits = equilibrium.limits()
+            present.inadmissible = not limits.admissible or limits.stop_signal > 0
             if not present.inadmissible:
-                self.convergence.set_max_chain_extension(extension.max_chain_extension)
+                self.convergence.set_max_chain_extension(limits.max_chain_extension)
                 present.safe_change = (
                     equilibrium.safe_change(NEAR_LIMIT) if self._uses_safe_change else 0.0
                 )
@@ -453,7 +459,7 @@ class GuardedNewton:
         # a point comes much too near to L, its forces are huge, and each iteration increases its
         # 1 - r/L only by a factor of 1.5.
         met, present = self.convergence.prescribed_gap <= PRESCRIBED_ROUNDING, self._present
-        improved = self._linear.improve(x, self._snes.getFunction()[0], step, met)
+        improved = self.linear.improve(x, self._snes.getFunction()[0], step, met)
         if present.first_iterate is None:
             first = x.array_r - step.array_r
             present.first_iterate = self._length(first - present.step_start[: first.size])
@@ -461,8 +467,8 @@ class GuardedNewton:
         # all states within the bound are admissible.
         largest = np.sqrt(3) * step.norm(PETSc.NormType.NORM_INFINITY)
         present.safe_change -= self.equilibrium.quadrature.largest_gradient * largest
-        present.is_certain = present.safe_change > 0.0
-        if present.is_certain:
+        present.is_known_admissible = present.safe_change > 0.0
+        if present.is_known_admissible:
             return improved
         self._from_petsc(x)
         before, trial = self.equilibrium.evaluate(), self._trial
@@ -470,7 +476,7 @@ class GuardedNewton:
             trial.waxpy(-1.0, step, x)
             self._from_petsc(trial)
             after = self.equilibrium.evaluate()
-            if after.extension.stop_signal or self._allows(before, after):
+            if after.limits.stop_signal or self._allows(before, after):
                 break
             step.scale(0.5)
         else:
@@ -485,8 +491,8 @@ class GuardedNewton:
 
     def _allows(self, before: PointState, after: PointState) -> bool:
         """Return whether a step is admissible: its end, a margin near L, and J > 0 on its path."""
-        near, equilibrium = after.extension.max_chain_extension > NEAR_LIMIT, self.equilibrium
-        if not after.extension.admissible:
+        near, equilibrium = after.limits.max_chain_extension > NEAR_LIMIT, self.equilibrium
+        if not after.limits.admissible:
             return False
         if near and not equilibrium.keeps_margin(
             before.stretches, after.stretches, RESERVE, NEAR_LIMIT
@@ -507,6 +513,6 @@ class GuardedNewton:
             return PETSc.SNES.ConvergedReason.CONVERGED_FNORM_ABS
         if present.short_steps >= SHORT_STEPS:
             return PETSc.SNES.ConvergedReason.DIVERGED_LOCAL_MIN
-        if iteration >= snes.getTolerances()[3] or self._linear.given_up:
+        if iteration >= snes.getTolerances()[3] or self.linear.given_up:
             return PETSc.SNES.ConvergedReason.DIVERGED_MAX_IT
         return PETSc.SNES.ConvergedReason.ITERATING

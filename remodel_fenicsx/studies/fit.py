@@ -252,9 +252,10 @@ def _bounded(key: str, unknown: Unknown, scene: Scene, starts: Mapping[str, floa
 
 
 def _measured(table: MeasuredTable, place: str, folder: Path, scene: Scene) -> Measured:
-    if table.state == "after" and scene.remodeling.turnover.is_on:
+    on = [f"remodeling.{one.name}" for one in scene.remodeling.processes if one.is_on]
+    if table.state == "after" and on:
         raise SceneError(
-            f"{place}.state = 'after': takes cells alone, not what remodeling.turnover has changed"
+            f"{place}.state = 'after': takes cells alone, not what {on[0]} has changed"
         )
     file = f"{place}.file = {format_value(table.file)}"
     columns = _read_columns(folder / table.file, file, scene)
@@ -352,7 +353,7 @@ def _check_columns(
         raise SceneError(f"{place}: has no measured column")
     if state == "history":
         if "time" not in columns:
-            raise SceneError(f"{place}: needs a column time with state = 'history'")
+            raise SceneError(f"{place}: needs a column 'time', because state = 'history'")
         if loads:
             raise SceneError(
                 f"{place}: {loads[0]}: with state = 'history' the scene's own ramps hold"
@@ -998,12 +999,12 @@ class Fit(StudyResult):
         text = f"RMS of the normalised residuals: {self.misfit:.2g}; "
         text += f"{same} of {len(self.minima)} starts end in this minimum."
         if self.limited_by == "model":
-            text += f" The model limits the accuracy: confidence intervals are {self.misfit:.2g} "
-            text += "times those of the noise."
+            text += " The model limits the accuracy: its residuals exceed the standard deviations, "
+            text += f"so all confidence intervals are {self.misfit:.2g} times as wide."
         pairs = np.argwhere(np.triu(np.abs(self.correlations) > CORRELATED, 1))
         together = [f"{keys[i]} and {keys[j]} ({self.correlations[i, j]:+.2f})" for i, j in pairs]
         if together:
-            text += f" Correlated above {CORRELATED:g}, so use the profiles: {', '.join(together)}."
+            text += f" Correlated: {', '.join(together)}; take their intervals from --profiles."
         return text
 
     def write(self, folder: Path) -> None:

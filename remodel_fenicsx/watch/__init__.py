@@ -9,12 +9,14 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 from remodel_fenicsx._lazy import resolved
+from remodel_fenicsx._renamed import with_old_names
 
 if TYPE_CHECKING:
     from remodel_fenicsx.evolution.stepper import LoadCaseSolver, Stepper, Watcher
     from remodel_fenicsx.scene.scene import Scene
 
 
+@with_old_names
 @dataclass(frozen=True)
 class WatcherKind:
     """Kind of watcher, registered by name.
@@ -24,7 +26,7 @@ class WatcherKind:
     maker
         Function of a scene and a stepper that returns a `Watcher`, or None if there is nothing to
         watch; or its dotted name.
-    each_case
+    checks_each_case
         Whether it watches solved states only, so that each load case has its own watcher.
 
     Examples
@@ -48,7 +50,7 @@ class WatcherKind:
     """
 
     maker: Callable[[Scene, Stepper], Watcher | None] | str
-    each_case: bool = False
+    checks_each_case: bool = False
 
     def make(self, scene: Scene, stepper: LoadCaseSolver) -> Watcher | None:
         """Return the watcher of a stepper or load case, or None if there is nothing to watch.
@@ -69,11 +71,11 @@ WATCHERS = {
     "over-correction": WatcherKind(
         "remodel_fenicsx.watch.over_correction:OverCorrection.for_scene"
     ),
-    "locking": WatcherKind(_WARNINGS + "LockingWarning.for_scene", each_case=True),
+    "locking": WatcherKind(_WARNINGS + "LockingWarning.for_scene", checks_each_case=True),
     "buckling": WatcherKind(
-        "remodel_fenicsx.watch.stability:BucklingWarning.for_scene", each_case=True
+        "remodel_fenicsx.watch.stability:BucklingWarning.for_scene", checks_each_case=True
     ),
-    "volume": WatcherKind(_WARNINGS + "VolumeLoss.for_scene", each_case=True),
+    "volume": WatcherKind(_WARNINGS + "VolumeLoss.for_scene", checks_each_case=True),
     "pressure-noise": WatcherKind(_WARNINGS + "PressureNoise.for_scene"),
     "weak-tension": WatcherKind(_WARNINGS + "WeakTension.for_scene"),
     "radial-chains": WatcherKind(_WARNINGS + "RadialChains.for_scene"),

@@ -22,8 +22,8 @@ if TYPE_CHECKING:
 ORDER = 3
 GAIN = 2.0**ORDER  # factor of the difference on the oscillating part
 # Factor of a pass, and number of successive passes, of an oscillation that is reported if it
-# exceeds `TOLD_SIZE` after one more pass. GROWING is the start of an instability, of the cells over
-# r0^2: all bodies that left their solution had it, and no other body.
+# exceeds `TOLD_SIZE` after one more pass. GROWING is the start of an instability, of the
+# cells, A/r0^2: all bodies that left their solution had it, and no other body.
 GROWING = -1.2, 2
 # SUSTAINED is its end, of the displacement relative to itself. Random cells oscillate for ever at
 # single points, without a common phase, which has hardly any effect on the body.
@@ -35,8 +35,7 @@ RESTED_SHARE = 0.5
 # more.
 MAX_STEP_RATIO = 1.5
 LOAD_JUMP = 1e-3  # largest oscillation of a load, relative to the load
-# RMS over the body of the change of A in one pass after a delay, over r0^2, above which a run
-# warns.
+# RMS over the body of the change of A/r0^2 in one pass after a delay, above which a run warns.
 RESUMED_CHANGE = 0.03
 
 

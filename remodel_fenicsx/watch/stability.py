@@ -70,7 +70,7 @@ class EquilibriumStability(Watcher):
         effort = work.tangents + OLD_FACTOR * max(0, work.newton_iterations - work.tangents)
         self._numbers["iterations"] = iterations = self._numbers["iterations"] + effort
         newton = self.stepper.coupling.newton
-        factorisation = newton.factorisation() if work.newton_iterations else None
+        factorisation = newton.linear.factorisation() if work.newton_iterations else None
         suspicious = factorisation is not None and self._curvature(factorisation) < 0 and known == 0
         overdue = iterations >= ITERATIONS_BETWEEN_LOOKS or (step.is_last and iterations > 0)
         if overdue and not suspicious and not self.every_step and self.unknowns > MOST_UNKNOWNS:
@@ -183,7 +183,7 @@ def described(mode: Mode, unloaded: float) -> str:
 # Strains of the finite differences of W for stresses and moduli, whose relative error is about
 # 1e-6.
 STRAINS = {1: 1e-5, 2: 1e-3}
-# Thrust over Euler's load. It is 0.8 to 1.1 when whole slender tubes lose their stability
+# Thrust / Euler's load. It is 0.8 to 1.1 when whole slender tubes lose their stability
 # (docs/theory.md, Buckling).
 WARNED_LOAD = 0.9
 AROUND, ALONG = range(1, 3)
@@ -274,7 +274,7 @@ class BucklingWarning(WarnsOnce):
         """Return central differences of W by one or two logarithmic strains, (n,). Collective."""
         # No chain reaches L.
         equilibrium = self.stepper.coupling.equilibrium
-        room = 1 - max(0.0, equilibrium.extension().max_chain_extension)
+        room = 1 - max(0.0, equilibrium.limits().max_chain_extension)
         h, total = STRAINS[len(axes)] * room, np.zeros(len(self._places))
         for signs in itertools.product((1.0, -1.0), repeat=len(axes)):
             strains = np.zeros(3)

@@ -28,15 +28,15 @@ Array = NDArray[np.float64]
 # Missing fraction of the displacement above which a run warns. docs/what_may_go_wrong.md has the
 # estimate and its error. The paper's bodies have at most 3.6 % (artery with random cells, t = 5).
 MAX_MISSING_FRACTION = 0.05
-# Work over the energy of the matrix. With less work the cells deform the body, not the loads.
+# Work / energy of the matrix. With less work the cells deform the body, not the loads.
 # Elastic tubes have at least 0.93 (up to 0.9 of the pressure that bursts them), the paper's bodies
 # 1.4.
 DRIVEN = 0.9
 # Factor on jumps between linear elements. At a wall, where strain varies most, an element has
 # neighbours on one side only, and half of the jump.
 JUMPS = 4.0
-# Missing fraction of the motion across an elongated body, over the fraction of volume changes in
-# the matrix's energy. By the tangent it is 1.6 to 3.3 (tubes, elongation 0.1, lambda/mu 8.8 to
+# Missing fraction of the motion across an elongated body / fraction of volume changes in the
+# matrix's energy. By the tangent it is 1.6 to 3.3 (tubes, elongation 0.1, lambda/mu 8.8 to
 # 250).
 HELD_BACK = 2.5
 MAX_NOISE_ROTATION_DEGREES = 2.0
@@ -294,8 +294,8 @@ class VolumeLoss(WarnsOnce):
         mean = self.quadrature.integral(jacobians) / self.quadrature.volume
         if mean < numbers["mean"]:
             numbers["mean"], numbers["mean_time"] = mean, step.time
-        of_formulation = self.quadrature.owned(self.state.dilatation.jacobians())
-        if of_formulation.shape[1]:
+        if self.state.dilatation.jacobian is not None:
+            of_formulation = self.quadrature.owned(self.state.dilatation.jacobians())
             jacobians = np.broadcast_to(of_formulation.min(axis=1)[:, None], jacobians.shape)
         least = self.quadrature.minimum(jacobians)
         if least < numbers["least"]:

@@ -50,13 +50,13 @@ def test_what_is_remembered_follows_every_change() -> None:
     """Of cells, unknowns and live parameters."""
     with made(scene()) as simulation:
         equilibrium, cells = simulation.stepper.coupling.equilibrium, simulation.cells
-        seen = [equilibrium.extension().max_chain_extension]
+        seen = [equilibrium.limits().max_chain_extension]
         simulation.unknown.x.array[:] = 0.05
-        seen.append(equilibrium.extension().max_chain_extension)
+        seen.append(equilibrium.limits().max_chain_extension)
         cells.dimension_values[:] *= 1.1
-        seen.append(equilibrium.extension().max_chain_extension)
+        seen.append(equilibrium.limits().max_chain_extension)
         equilibrium.tissue.contour_length.value *= 2
-        seen.append(equilibrium.extension().max_chain_extension)
+        seen.append(equilibrium.limits().max_chain_extension)
         np.testing.assert_allclose(np.array(seen[1:]) / seen[:-1], [1.05, 1.1, 0.5], rtol=1e-12)
 
 

@@ -67,7 +67,7 @@ def compiled(blend):
 def in_parts(coupling, step, time, old_loads, loads, work, again):
     if coupling.state.number < 3:
         return whole(coupling, step, time, old_loads, loads, work, again)
-    coupling._solve_in_parts(4.0, dict(coupling.state.loading.values), loads, work, None)
+    coupling._solve_in_substeps(4.0, dict(coupling.state.loading.values), loads, work, None)
 CellHomotopy.equilibrium = property(compiled)
 Staggered._solve = in_parts
 sys.exit(cli.main(sys.argv[1:]))

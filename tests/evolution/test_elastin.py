@@ -252,7 +252,7 @@ def test_walls_rest_where_an_independent_program_says(
     """Radii, means, angles, cut, radii and length without loads, force under other pressures."""
     scene = vessel([], **values(changes))
     turnover = scene.remodeling.turnover
-    changing = {"growth": turnover.grows} | dict.fromkeys(GROWN[:2], turnover.is_on)
+    changing = {"growth": bool(turnover.growth_key)} | dict.fromkeys(GROWN[:2], turnover.is_on)
     columns = [name for name in MEANS if changing.get(name, True)]
     columns += [*WALL, *ANGLES]
     with simulated(scene.with_values({"output.columns": columns})) as (simulation, of_run):

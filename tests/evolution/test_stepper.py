@@ -93,7 +93,7 @@ class Notes(Watcher):
     def solved(self, step: Step) -> None:
         assert step.loads == self.state.loading.values == {"force": 1.0 + step.time}
         assert step.remodeling_power == step.seconds == 0.0 and step.work.newton_iterations > 0
-        assert step.extension == self.stepper.coupling.equilibrium.extension()
+        assert step.limits == self.stepper.coupling.equilibrium.limits()
         self.note("solved", step)
 
     def completed(self, step: Step) -> None:
@@ -214,7 +214,7 @@ def test_extension_names_the_point_where_chains_are_longest() -> None:
     x = made.nodes[:, :1]
     made.set_displacement(np.hstack([0.2 * x**2, -0.1 * made.nodes[:, 1:2], 0 * x]))
     problem = made.problem()
-    found = problem.extension()
+    found = problem.limits()
     # between the nodes u is linear: F_xx = 1 + 0.2 (x_1 + x_2) with x from 1/2 to 1
     assert found.max_chain_extension == pytest.approx(1.3 / 1.594, rel=1e-13)
     assert found.min_jacobian == pytest.approx(1.1 * 0.9, rel=1e-13)

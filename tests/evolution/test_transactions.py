@@ -45,7 +45,7 @@ def everything(simulation: Simulation) -> dict[str, Any]:
         "solved n": solved.axis_values.copy(),
         "loads": list(simulation.loading.values.values()),
         "magnitudes": [float(constant.value) for constant in loads.constants()],
-        "extension": simulation.stepper.coupling.equilibrium.extension().max_chain_extension,
+        "extension": simulation.stepper.coupling.equilibrium.limits().max_chain_extension,
         "time": state.time,
         "number": state.number,
     }

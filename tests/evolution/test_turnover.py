@@ -241,28 +241,28 @@ def test_a_step_in_parts_has_parts_of_its_turnover(
     whole = rows_of(values)
     simulation = Simulation(scene_from_dict(values))
     coupled, turnover = simulation.stepper.coupling, simulation.stepper.process("turnover")
-    set_part, parts, refused = turnover.set_part, [], set()
+    set_fraction, parts, refused = turnover.set_fraction, [], set()
     newton = coupled.blend.newton
     solve = newton.solve
 
     def in_parts(
         step: Any, time: float, old_loads: Any, loads: Any, work: Any, again: bool
     ) -> None:
-        coupled._solve_in_parts(time, old_loads, loads, work, None)
+        coupled._solve_in_substeps(time, old_loads, loads, work, None)
 
     def solved(origin: Any = None, loose_tolerance: bool = False) -> Any:
         if simulation.state.number not in refused:
             refused.add(simulation.state.number)
-            raise SolveFailure("in vain", Solution(extension=coupled.equilibrium.extension()))
+            raise SolveFailure("in vain", Solution(limits=coupled.equilibrium.limits()))
         return solve(origin, loose_tolerance)
 
     def noted(fraction: float) -> None:
-        set_part(fraction)
+        set_fraction(fraction)
         parts.append((fraction, turnover.logarithms()[0].mean()))
 
     monkeypatch.setattr(newton, "solve", solved)
     monkeypatch.setattr(coupled, "_solve", in_parts)
-    monkeypatch.setattr(turnover, "set_part", noted)
+    monkeypatch.setattr(turnover, "set_fraction", noted)
     rows = [dict(step.row) for step in simulation.steps()]
     simulation.close()
     for name in (*COLUMNS, *ANGLES, "outer_radius"):

@@ -113,7 +113,7 @@ def test_the_guard_knows_j_where_the_formulation_takes_it() -> None:
         )
         assert at_centre == pytest.approx(0.7**3, rel=1e-12)
         assert (at_points > at_centre) == (sign < 0) and abs(at_points - at_centre) > 1e-3
-        assert problem.extension().min_jacobian == min(at_points, at_centre)
+        assert problem.limits().min_jacobian == min(at_points, at_centre)
 
 
 # ---------------------------------------------------------------- bodies that lock

@@ -86,7 +86,8 @@ def arrows() -> list[Import]:
 
 def room(module: str) -> str:
     """The room of a module; the tables of a scene name parts of rooms above the other modules of theirs."""
-    return module if module == "schema.settings" else module.split(".")[0]
+    tables = module.startswith(("schema.settings", "schema.processes"))
+    return "schema.settings" if tables else module.split(".")[0]
 
 
 def test_every_file_is_in_a_room() -> None:

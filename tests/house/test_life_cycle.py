@@ -32,8 +32,18 @@ for shape in ("cube", "tube", "tendon"):
     if shape == "tube":
         scene = scene.with_values({"model.kinematics": "radial"})
     steps = list(Simulation(scene).steps())
-    assert len(steps) == 3 and steps[-1].extension.max_chain_extension > 0.4
+    assert len(steps) == 3 and steps[-1].limits.max_chain_extension > 0.4
 print(*(name for name in sys.modules if name.startswith("remodel_fenicsx.evolution.")))
+"""
+UNKNOWN = """
+from remodel_fenicsx import SceneError, preset_scene
+from remodel_fenicsx.extend import COLUMNS_ON_REQUEST
+assert not {"growth", "collagen_share", "turnover_power"} & {*COLUMNS_ON_REQUEST}
+for values in ({"remodeling.turnover": {"time": 40.0}}, {"output.columns": ["turnover_power"]}):
+    try:
+        preset_scene("kuhl-holzapfel-2007", "tube").with_values(values)
+    except SceneError as error:
+        print(error)
 """
 
 
@@ -50,14 +60,20 @@ def test_the_heart_hardly_asks_for_a_feature() -> None:
     assert not [line for line in lines if re.match(r"\s*(from|import) ", line)]
 
 
-@pytest.mark.parametrize("files", [("turnover.py",), ("turnover.py", "load_cases.py")])
-def test_a_feature_leaves_with_its_file(files: tuple[str, ...], tmp_path: Path) -> None:
-    """Cube, tube and tendon run in a copy of the package without it."""
+TURNOVER = ("evolution/turnover.py", "schema/processes/turnover.py")
+
+
+@pytest.mark.parametrize("files", [TURNOVER, (*TURNOVER, "evolution/load_cases.py")])
+def test_a_feature_leaves_with_its_files(files: tuple[str, ...], tmp_path: Path) -> None:
+    """Cube, tube and tendon run in a copy of the package without it; its keys and columns are unknown."""
     copy = tmp_path / PACKAGE.name
     shutil.copytree(PACKAGE, copy, ignore=shutil.ignore_patterns("__pycache__"))
     for file in files:
-        (copy / "evolution" / file).unlink()
-    command = [sys.executable, "-c", THREE_BODIES]
+        (copy / file).unlink()
+    command = [sys.executable, "-c", THREE_BODIES + UNKNOWN]
     done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stderr
-    assert "remodel_fenicsx.evolution.stepper" in done.stdout.split()
+    modules, table, column = done.stdout.splitlines()
+    assert "remodel_fenicsx.evolution.stepper" in modules.split()
+    assert re.match(r"remodeling\.turnover = \{time = 40\.0\}: unknown key; ", table)
+    assert re.match(r"output\.columns = 'turnover_power': no such column on request; ", column)

@@ -17,7 +17,7 @@ from remodel_fenicsx.model.drivers import DRIVERS, FRAMES
 from remodel_fenicsx.model.energy import Tissue
 from remodel_fenicsx.model.laws import LAWS, Drive
 from remodel_fenicsx.model.tensor_law import (
-    ABOVE_ROUNDING,
+    MIN_TENSION_OVER_ROUNDING,
     Target,
     switch_threshold,
     relax_exactly,
@@ -213,9 +213,9 @@ def test_what_is_out_of_balance_counts_once() -> None:
     """The rounding is widened for Newton's method; a residual, which may be large, is not: half there, and no more."""
     tension = np.diag([1e-3, 0.0, 0.0])[None]
     assert target(tension, switch_threshold(1e-3, 0.0)).switch[0] == pytest.approx(0.5)
-    assert target(tension, switch_threshold(0.0, 1e-3 / ABOVE_ROUNDING)).switch[0] == pytest.approx(
-        0.5
-    )
+    assert target(tension, switch_threshold(0.0, 1e-3 / MIN_TENSION_OVER_ROUNDING)).switch[
+        0
+    ] == pytest.approx(0.5)
 
 
 def test_between_and_beyond_targets_the_direction_has_trace_one_and_the_share_is_one() -> None:

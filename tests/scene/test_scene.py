@@ -361,7 +361,7 @@ def test_growth_from_rest_is_growth_from_equilibrium():
         for start in ("equilibrium", "rest")
     )
     assert now == before
-    assert now.remodeling.turnover.starts_at_rest
+    assert now.remodeling.turnover.starts_at_equilibrium
 
 
 def test_a_changed_copy_is_validated():

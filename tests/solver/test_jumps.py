@@ -73,7 +73,7 @@ def test_a_refusal_beyond_it_is_no_matter_of_the_tolerance() -> None:
         before = [simulation.unknown.x.array.copy() for _ in simulation.steps()][-2]
         last = simulation.unknown.x.array - before
         failure = SolveFailure(
-            "refused", Solution(25, 25, extension=StateLimits(0.7, 1.0, (0.0, 0.0, 0.0))), 50.0
+            "refused", Solution(25, 25, limits=StateLimits(0.7, 1.0, (0.0, 0.0, 0.0))), 50.0
         )
         refusal = diagnose_failure(simulation.stepper.coupling.newton, failure, last)
     assert refusal.kind == "limit point"

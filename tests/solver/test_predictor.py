@@ -72,7 +72,7 @@ def nearly_straight(predictor: Predictor, step: LoadStep) -> np.ndarray | None:
     tissue = pulled_cube(4.0).material.tissue(pulled_cube(4.0).cells.end_to_end_length)
     unknown, extension = (
         predictor.state.unknown.x.array,
-        Equilibrium(predictor.state, tissue).extension,
+        Equilibrium(predictor.state, tissue).limits,
     )
     last, factors = unknown.copy(), [1.0, 20.0]
     if not predictor.state.number:
@@ -104,9 +104,7 @@ def test_what_is_expected_wrongly_costs_no_step(
     def failing(newton: GuardedNewton, origin: Any = None) -> Any:
         if not failed or failed[-1] != newton.equilibrium.state.number:
             failed.append(newton.equilibrium.state.number)
-            raise SolveFailure(
-                "made to fail", Solution(3, 3, extension=newton.equilibrium.extension())
-            )
+            raise SolveFailure("made to fail", Solution(3, 3, limits=newton.equilibrium.limits()))
         return solve(newton, origin)
 
     monkeypatch.setattr(Predictor, "expected", lambda self, step: self.state.unknown.x.array + 0.0)

@@ -109,7 +109,7 @@ def small_steps() -> np.ndarray:
     for force in np.linspace(0.0, OVERSIZED, 31)[1:]:
         made.loading.set({"force": force})
         problem.solve()
-    assert problem.extension().max_chain_extension == pytest.approx(0.938, abs=2e-3)
+    assert problem.limits().max_chain_extension == pytest.approx(0.938, abs=2e-3)
     return made.displacement.x.array.copy()
 
 
@@ -130,7 +130,7 @@ def test_one_oversized_step_ends_on_the_branch_or_where_it_began(
         assert line_search != "basic"  # the default profile arrives
         assert not made.displacement.x.array.any()
     else:
-        assert problem.extension().admissible
+        assert problem.limits().admissible
         np.testing.assert_allclose(made.displacement.x.array, small_steps, atol=1e-9)
 
 
@@ -163,7 +163,7 @@ def test_wrong_branch_is_there_and_refused(monkeypatch: pytest.MonkeyPatch) -> N
         and problem.newton._snes.getFunctionNorm() < 1e-9
     )
     assert caught.value.newton_iterations < 10
-    assert caught.value.extension.max_chain_extension == pytest.approx(2.7212, abs=1e-3)
+    assert caught.value.limits.max_chain_extension == pytest.approx(2.7212, abs=1e-3)
     np.testing.assert_array_equal(made.displacement.x.array, start)
 
 
@@ -200,7 +200,7 @@ def test_no_point_that_turns_is_left_out() -> None:
         for at in range(len(F)):
             ends = [
                 PointState(
-                    problem.extension(), np.zeros(1), np.linalg.det(X[at : at + 1]), X[at : at + 1]
+                    problem.limits(), np.zeros(1), np.linalg.det(X[at : at + 1]), X[at : at + 1]
                 )
                 for X in (F, G)
             ]
@@ -217,8 +217,8 @@ def test_a_state_that_is_not_finite_is_at_its_limits(number: float) -> None:
     made.displacement.x.array[0] = number
     look = problem.evaluate()
     bad = np.isinf(look.stretches)
-    assert bad.any() and not look.extension.admissible
-    assert look.extension.max_chain_extension == np.inf and look.extension.min_jacobian == -np.inf
+    assert bad.any() and not look.limits.admissible
+    assert look.limits.max_chain_extension == np.inf and look.limits.min_jacobian == -np.inf
     np.testing.assert_array_equal(look.stretches[~bad], elsewhere[~bad])
 
 
@@ -263,7 +263,7 @@ def test_nan_anywhere_is_a_failure_not_a_result(where: str) -> None:
     }[where]
     function.x.array[7] = np.nan
     before = made.displacement.x.array.copy()
-    extension = problem.extension()
+    extension = problem.limits()
     assert not extension.admissible and extension.max_chain_extension == np.inf
     with pytest.raises(SolveFailure):
         problem.solve()

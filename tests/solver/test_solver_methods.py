@@ -93,7 +93,7 @@ def test_all_methods_come_to_the_same_states(
     solver, iterations = simulation.stepper.coupling.newton, sum(
         row["newton_iterations"] for row in rows
     )
-    tangents, krylov = solver._linear.tangents, sum(row["linear_iterations"] for row in rows)
+    tangents, krylov = solver.linear.tangents, sum(row["linear_iterations"] for row in rows)
     if method == "lagged":
         assert len(factors) == tangents < iterations / 2 and krylov == iterations
     else:
@@ -105,9 +105,11 @@ def test_options_of_ones_own_lie_over_the_methods(direct: list[dict[str, float]]
     """A preconditioner of one's own is kept like the factors."""
     options = {"pc_type": "lu", "pc_factor_mat_solver_type": "mumps"}
     simulation, rows = simulated("lagged", solver__petsc_options=options)
-    assert simulation.stepper.coupling.newton.factorisation().getFactorSolverType() == "mumps"
     assert (
-        simulation.stepper.coupling.newton._linear.tangents
+        simulation.stepper.coupling.newton.linear.factorisation().getFactorSolverType() == "mumps"
+    )
+    assert (
+        simulation.stepper.coupling.newton.linear.tangents
         < sum(row["newton_iterations"] for row in rows) / 2
     )
     assert_same(rows, direct)
@@ -398,23 +400,23 @@ def test_what_the_bound_spares_is_admissible(monkeypatch: pytest.MonkeyPatch) ->
 
     def checked(self: GuardedNewton, *arguments: Any) -> None:
         assemble(self, *arguments)
-        spared.append(self._present.is_certain)
-        if self._present.is_certain:
-            extension = self.equilibrium.extension()
+        spared.append(self._present.is_known_admissible)
+        if self._present.is_known_admissible:
+            extension = self.equilibrium.limits()
             assert extension.admissible and extension.max_chain_extension < 0.95
 
     monkeypatch.setattr(GuardedNewton, "_assemble_residual", checked)
     simulation, _ = simulated("lagged", solver__predictor="autoregressive", time__end=4.0)
     assert sum(spared) > len(spared) / 2
     equilibrium, x = simulation.stepper.coupling.equilibrium, simulation.unknown.x.array
-    near = equilibrium.extension().max_chain_extension + 1e-3
+    near = equilibrium.limits().max_chain_extension + 1e-3
     for far in (near, 0.95, 0.99, 1.0):  # as far as the bound allows, in many directions
         change, start = equilibrium.safe_change(far), x.copy()
         for seed in range(5):
             way = np.random.default_rng(seed).standard_normal((len(x) // 3, 3))
             way /= np.linalg.norm(way, axis=1).max()
             x[:] = start + 0.999 * change / simulation.quadrature.largest_gradient * way.ravel()
-            extension = equilibrium.extension()
+            extension = equilibrium.limits()
             assert extension.admissible and extension.max_chain_extension < far
         x[:] = start
     simulation.close()

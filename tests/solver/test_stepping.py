@@ -73,7 +73,7 @@ def test_a_remodeling_increment_beyond_the_contour_length_ends_where_a_good_star
     """The new cells are too long at the old displacement: exchanged in parts, then loaded, the state is the same."""
     made, stepper = loaded_and_remodeled(driver, frame, 60.0)
     coupling: Any = stepper.coupling
-    assert coupling.equilibrium.extension().max_chain_extension > 1.0
+    assert coupling.equilibrium.limits().max_chain_extension > 1.0
     with pytest.raises(SolveFailure):
         coupling.newton.solve()
     assert "equilibrium" not in vars(
@@ -84,7 +84,7 @@ def test_a_remodeling_increment_beyond_the_contour_length_ends_where_a_good_star
     assert solve(stepper, FORCE + 1.0).substeps > 1
     assert said[0].startswith("t = 15, 0 % of the change of the cells, attempt 1: ")
     assert any(" % of the change of the loads, attempt " in words for words in said)
-    assert coupling.equilibrium.extension().admissible
+    assert coupling.equilibrium.limits().admissible
     assert made.loading.values == {"force": FORCE + 1.0}
     energy, found = coupling.equilibrium.stored_energy(), made.displacement.x.array.copy()
 
@@ -112,7 +112,7 @@ def test_the_first_part_of_an_exchange_is_no_longer_than_its_bound(
         return real(newton, origin, loose_tolerance)
 
     monkeypatch.setattr(GuardedNewton, "solve", noted)
-    monkeypatch.setattr(coupling.blend, "largest_part", lambda done: 0.1)
+    monkeypatch.setattr(coupling.blend, "largest_increment", lambda done: 0.1)
     solve(stepper, FORCE + 1.0)
     parts_of_it = np.diff(done)
     assert parts_of_it.max() == pytest.approx(0.1) and done[-1] == 1.0
@@ -127,10 +127,10 @@ def test_the_bound_of_a_part_is_where_the_first_point_has_lost_its_share() -> No
         blend.set(theta)
         return 1 - np.sqrt(blend.equilibrium.squared_lengths()) / parts.MATERIAL.contour_length
 
-    first = blend.largest_part(0.0)
+    first = blend.largest_increment(0.0)
     for done in (0.0, first / 2):
         before = left(done)
-        assert np.min(left(done + blend.largest_part(done)) / before) == pytest.approx(
+        assert np.min(left(done + blend.largest_increment(done)) / before) == pytest.approx(
             0.2, abs=1e-9
         )
 
@@ -188,7 +188,7 @@ class Refusing:
         self.tried.append(force)
         if force - self.accepted[-1] > self.limit:
             raise SolveFailure(
-                "too much", Solution(7, 7, extension=StateLimits(0.9, 0.5, (0.0, 0.0, 0.0)))
+                "too much", Solution(7, 7, limits=StateLimits(0.9, 0.5, (0.0, 0.0, 0.0)))
             )
         self.accepted.append(force)
         return Solution(3, 3)
@@ -284,7 +284,7 @@ def test_after_an_exchange_of_the_cells_the_loads_are_tried_in_one_piece(
         )
         if len(tried) == 1:
             raise SolveFailure(
-                "too much", Solution(7, 7, extension=StateLimits(0.9, 0.5, (0.0, 0.0, 0.0)))
+                "too much", Solution(7, 7, limits=StateLimits(0.9, 0.5, (0.0, 0.0, 0.0)))
             )
         return Solution(3, 3)
 

@@ -239,6 +239,6 @@ def test_a_residual_that_is_almost_small_enough_is_a_matter_of_the_tolerance(
 ) -> None:
     made = parts.body(cube(comm=MPI.COMM_SELF), Cells(initial="isotropic")).supported()
     failure = SolveFailure(
-        "refused", Solution(25, 25, extension=StateLimits(0.7, 1.0, (0.0, 0.0, 0.0))), left
+        "refused", Solution(25, 25, limits=StateLimits(0.7, 1.0, (0.0, 0.0, 0.0))), left
     )
     assert diagnose_failure(made.problem().newton, failure).kind == kind

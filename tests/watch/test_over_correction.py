@@ -133,7 +133,7 @@ class Scripted:
             float(number),
             number,
             {"force": 1.0},
-            self.stepper.coupling.equilibrium.extension(),
+            self.stepper.coupling.equilibrium.limits(),
             Work(),
         )
 
