@@ -48,6 +48,9 @@ MOST_RADII, LEAST_RADII = 3.0, 2e-3
 # Smallest distance of the outer face from the lumen, over the thickness. A closer face lies in
 # another part of the wall.
 MIN_CLEARANCE = 0.5
+# Where a wall folds or meets itself it gets thinner by this factor until it does not, down to
+# LEAST_THINNED of the thickness that was asked for, and around there by a slope.
+THINNING, LEAST_THINNED, SLOPE = 0.9, 0.2, 0.25
 # Edges of a tetrahedron, in the order of its mid-edge nodes.
 EDGES = ([0, 1], [1, 2], [0, 2], [0, 3], [1, 3], [2, 3])
 
@@ -182,6 +185,7 @@ class ExtrudedWall(NamedTuple):
     layers: Integers
     faces: dict[str, Integers]
     straight: int
+    allowed: Array  # thickness at the surface's corners
 
 
 def extrude_wall(
@@ -199,22 +203,17 @@ def extrude_wall(
     size, layer = len(surface.points), np.arange(len(levels) - 1)[:, None, None]
     wedges = np.concatenate([surface.triangles, surface.triangles + size], axis=1) + size * layer
     tetrahedra = split_wedges(wedges.reshape(-1, 6)).reshape(-1, 4)
-    normals = _normals(surface, openings)
-    for _ in range(SMOOTHINGS):
-        points = (surface.points + levels[:, None, None] * thickness[:, None] * normals).reshape(
+    normals = _smoothed_normals(surface, openings, levels, thickness, tetrahedra)
+    allowed = thickness
+    while True:
+        points = (surface.points + levels[:, None, None] * allowed[:, None] * normals).reshape(
             -1, 3
         )
-        folded = np.linalg.det(points[tetrahedra[:, 1:]] - points[tetrahedra[:, :1]]) <= 0
-        if not folded.any():
+        faulty = _crossed(surface.points, points[-size:], allowed)
+        faulty[tetrahedra[_folded(points, tetrahedra)] % size] = True
+        if not faulty.any():
             break
-        normals = _around(surface, normals[surface.triangles].sum(axis=1), openings)
-    else:
-        place = points[tetrahedra[folded][0]].mean(axis=0)
-        raise SceneError(
-            f"--thickness: too thick: the wall folds at {format_position(place)}, "
-            "where the lumen is concave"
-        )
-    _check_self_intersection(surface.points, points[-size:], thickness)
+        allowed = _thinned(surface, faulty, allowed, thickness)
     of_layer = np.repeat(np.repeat(np.arange(len(layers)), counts), 3 * len(surface.triangles))
     faces = {"inner": surface.triangles, "outer": surface.triangles + size * (len(levels) - 1)}
     quads = [np.concatenate([rim, rim[:, ::-1] + size], axis=1) + size * layer for rim in openings]
@@ -232,7 +231,7 @@ def extrude_wall(
     feet, is_edge = surface.points[ends].mean(axis=1), ends[:, 0] != ends[:, 1]
     feet[is_edge] = rounded(given, feet[is_edge], np.isin(below, rim_edges @ key)[is_edge])
     outwards, depth = normals[ends].mean(axis=1), np.repeat(levels, size)[pairs].mean(axis=1)
-    outwards *= (thickness[ends].mean(axis=1) / np.linalg.norm(outwards, axis=1))[:, None]
+    outwards *= (allowed[ends].mean(axis=1) / np.linalg.norm(outwards, axis=1))[:, None]
     points = np.concatenate([points, feet[row] + depth[:, None] * outwards[row]])
 
     def with_middles(cells: Integers, edges: Sequence[Sequence[int]]) -> Integers:
@@ -241,7 +240,7 @@ def extrude_wall(
 
     elements = with_middles(tetrahedra, EDGES)
     faces = {name: with_middles(face, EDGES[:3]) for name, face in faces.items()}
-    return ExtrudedWall(points, elements, of_layer, faces, _straightened(points, elements))
+    return ExtrudedWall(points, elements, of_layer, faces, _straightened(points, elements), allowed)
 
 
 def _straightened(points: Array, tetrahedra: Integers) -> int:
@@ -275,16 +274,58 @@ def _normals(surface: Surface, openings: Sequence[Integers]) -> Array:
     return _around(surface, area_vectors(surface.points[surface.triangles]), openings)
 
 
-def _check_self_intersection(inner: Array, outer: Array, thickness: Array) -> None:
-    """Check that the wall does not reach into another part of itself or of the lumen."""
+def _smoothed_normals(
+    surface: Surface,
+    openings: Sequence[Integers],
+    levels: Array,
+    thickness: Array,
+    tetrahedra: Integers,
+) -> Array:
+    """Return the normals, smoothed until no element folds, or those that fold the fewest."""
+    normals = best = _normals(surface, openings)
+    fewest = len(tetrahedra)
+    for _ in range(SMOOTHINGS):
+        points = surface.points + levels[:, None, None] * thickness[:, None] * normals
+        folds = int(_folded(points.reshape(-1, 3), tetrahedra).sum())
+        if folds < fewest:
+            best, fewest = normals, folds
+        if not folds:
+            break
+        normals = _around(surface, normals[surface.triangles].sum(axis=1), openings)
+    return best
+
+
+def _folded(points: Array, tetrahedra: Integers) -> Flags:
+    return np.asarray(np.linalg.det(points[tetrahedra[:, 1:]] - points[tetrahedra[:, :1]]) <= 0)
+
+
+def _crossed(inner: Array, outer: Array, thickness: Array) -> Flags:
+    """Return where the wall reaches into another part of itself or of the lumen, (points,)."""
     from scipy.spatial import cKDTree
 
-    distance, _ = cKDTree(inner).query(outer)
-    if (crossed := distance < MIN_CLEARANCE * thickness).any():
-        place = outer[int(np.argmax(crossed))]
+    return np.asarray(cKDTree(inner).query(outer)[0] < MIN_CLEARANCE * thickness)
+
+
+def _thinned(surface: Surface, faulty: Flags, allowed: Array, thickness: Array) -> Array:
+    """Return a smaller thickness at faulty points, which grows around them by a slope."""
+    worst = np.flatnonzero(faulty)[np.argmin((allowed / thickness)[faulty])]
+    place = format_position(surface.points[worst])
+    area = np.linalg.norm(area_vectors(surface.points[surface.triangles]), axis=1).sum()
+    radius = 2 * _signed_volume(surface.points, surface.triangles) / area
+    if thickness[worst] > radius or allowed[worst] < LEAST_THINNED * thickness[worst]:
         raise SceneError(
-            f"--thickness: too thick: the wall intersects the vessel at {format_position(place)}"
+            f"--thickness: too thick: the wall folds or meets itself at {place}, also with a "
+            f"thickness of {allowed[worst]:.3g}; the lumen's radius is {radius:.3g}"
         )
+    result = np.where(faulty, THINNING * allowed, allowed)
+    edges = surface.triangles[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2)
+    rise = SLOPE * np.linalg.norm(np.diff(surface.points[edges], axis=1)[:, 0], axis=1)
+    before = None
+    while before is None or (result < before).any():
+        before = result.copy()
+        for start, end in (edges.T, edges.T[::-1]):
+            np.minimum.at(result, end, result[start] + rise)
+    return result
 
 
 # ---------------------------------------------------------------- the command
@@ -324,7 +365,8 @@ def write_wall(
     if len(read.triangles) > LARGE_SURFACE:
         announce(f"{surface}: remeshing {len(read.triangles)} triangles takes minutes")
     divided, near = remeshed(read, size)
-    wall = extrude_wall(divided, read, depth[near], shares or {"wall": 1.0}, through)
+    asked = depth[near]
+    wall = extrude_wall(divided, read, asked, shares or {"wall": 1.0}, through)
     if taken := shares.keys() & wall.faces:
         raise SceneError(f"--layers {min(taken)}=...: a face has this name; rename the layer")
     names = list(shares) or ["wall"]
@@ -350,6 +392,13 @@ def write_wall(
         f"faces {', '.join(wall.faces)}; "
         + (f"regions {', '.join(names)}" if shares else "one region"),
     ]
+    if (thinner := wall.allowed < asked).any():
+        thinnest = int(np.argmin(wall.allowed / asked))
+        lines.append(
+            f"thinner than asked at {thinner.sum()} of {len(thinner)} corners, where the wall would "
+            f"fold or meet itself; least {wall.allowed[thinnest]:.3g} for {asked[thinnest]:.3g} at "
+            f"{format_position(divided.points[thinnest])}"
+        )
     if wall.straight:
         lines.append(f"{wall.straight} edges are straight: curved ones would invert elements")
     return lines

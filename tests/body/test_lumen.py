@@ -332,3 +332,24 @@ def test_files_that_are_none_are_refused_in_one_line(
     said = refused("wall", tmp_path / name, *words)
     assert name in said and "/proc/" not in said and "Compos" not in said
     assert [path.name for path in tmp_path.iterdir()] == [name]
+
+
+def test_a_wall_gets_thinner_where_it_would_fold(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Inside a bend there is room for its radius of curvature less that of the lumen."""
+    bend, thickness = 2.6, 0.8
+    file, path = tmp_path / "bend.vtp", tmp_path / "wall.msh"
+    points, triangles = tube(bend)
+    written(file, points, triangles)
+    assert wall(file, "--thickness", thickness, "--size", 0.3, "-o", path) == 0
+    said = re.search(
+        r"thinner than asked at \d+ of .*; least ([\d.]+) for 0.8 at", capsys.readouterr().out
+    )
+    room = LENGTH / bend - RADIUS
+    assert said is not None and 0.5 * room < float(said[1]) < 1.1 * room
+    volumes(path)  # has no element that folds
+    mesh = meshio.read(path)
+    far = LENGTH / bend + RADIUS  # of the lumen's outside from the axis of the bend
+    distance = np.hypot(mesh.points[:, 0] + LENGTH / bend, mesh.points[:, 2])
+    assert distance.max() == pytest.approx(far + thickness, rel=5e-3)
