@@ -12,7 +12,15 @@ from typing import Any, ClassVar, NamedTuple, TYPE_CHECKING
 import numpy as np
 
 from remodel_fenicsx.body.gmsh_model import mesh_length_problem
-from remodel_fenicsx.body.shape import Column, Columns, Regions, Unloads, WithAxes, WithRegions
+from remodel_fenicsx.body.shape import (
+    Column,
+    Columns,
+    LoadKind,
+    Regions,
+    Unloads,
+    WithAxes,
+    WithRegions,
+)
 from remodel_fenicsx.model.axes import LocalAxes
 from remodel_fenicsx.model.cells import pitch_angle, radial_fraction
 from remodel_fenicsx.model.energy import Tissue
@@ -128,6 +136,43 @@ def prestretch(natural: Natural, local_axes: LocalAxes, domain: Domain) -> Array
                 layer.prestretch.stretches
             )
     return stretches
+
+
+# ---------------------------------------------------------------- the lumen
+
+
+def lumen_pressure(m: Any) -> float:
+    """Return the pressure of a measurement, a load or an unknown. Collective."""
+    return float(m.state.loading.lumen_pressure())
+
+
+def _expansion(m: Any) -> float:
+    """Return V/V_0 - 1 of the lumen. Collective."""
+    from remodel_fenicsx.fem import jit
+    from remodel_fenicsx.fem.assembly import integral
+
+    def compiled() -> tuple[Any, float, float]:
+        loading, (across, caps) = m.state.loading, m.observer.shape.lumen(m.domain)
+        volume, start = loading.lumen_volume("inner", across)
+        measure = loading.surface_measure("inner")
+        return jit.form(volume(m.state.unknown) * loading.weight * measure), start, caps
+
+    form, start, caps = m.cached("expansion of the lumen", compiled)
+    return (integral(form) - start) / (start + caps)
+
+
+LUMEN_EXPANSION = LoadKind(
+    lambda shape, loading, name: loading.add_lumen_expansion(
+        name, "inner", *shape.lumen(loading.domain)
+    ),
+    "change of the lumen's volume over its reference volume: prescribed, with the pressure as an "
+    "unknown, or computed",
+    above=-1.0,
+    reductions=("radial", "axisymmetric", "sector"),
+    value=_expansion,
+    makes_pressure_unknown=True,
+    replaces="pressure",
+)
 
 
 # ---------------------------------------------------------------- bodies with inner and outer face
