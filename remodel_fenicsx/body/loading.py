@@ -171,11 +171,11 @@ class Loading:
             If the kinematics is not that of a mesh in three dimensions.
         """
         self._check_three_dimensional("fixed facets")
-        for component, scale in enumerate(np.broadcast_to(direction, 3).tolist()):
+        for component, scale in enumerate(np.broadcast_to(direction, 3)):
             value = self.constant(0.0)
             self._prescribe_facets(facets, component, value)
             if name is not None:
-                self._take(name, value, scale)
+                self._take(name, value, float(scale))
 
     # ------------------------------------------------------------ loads
     def add_dead_force(
@@ -269,9 +269,7 @@ class Loading:
 
         self.add_potential(potential)
 
-    def lumen_volume(
-        self, face: str, across: Array
-    ) -> tuple[Callable[[Function], Expr], float]:
+    def lumen_volume(self, face: str, across: Array) -> tuple[Callable[[Function], Expr], float]:
         """Return the lumen's volume, per reference area of its face, and at the start. Collective.
 
         The volume is -1 times the integral of P x . cof(F) N over the face. P projects to the
@@ -307,9 +305,7 @@ class Loading:
         at_start = volume(dolfinx.fem.Function(self.space)) * self.weight
         return volume, integral(jit.form(at_start * self.surface_measure(face)))
 
-    def add_lumen_expansion(
-        self, name: str, face: str, across: Array, caps: float = 0.0
-    ) -> None:
+    def add_lumen_expansion(self, name: str, face: str, across: Array, caps: float = 0.0) -> None:
         """Prescribe the volume of the lumen if its pressure is an unknown (`UnknownPressure`).
 
         Parameters
@@ -338,6 +334,12 @@ class Loading:
             return -(pressure(u) * work + pressure(test) * gap) * self.weight * measure
 
         self._terms.append(residual)
+
+    def lumen_expansion(self, face: str, across: Array, caps: float = 0.0) -> Callable[[], float]:
+        """Return a function for V/V_0 - 1 of the lumen; see `add_lumen_expansion`. Collective."""
+        volume, start = self.lumen_volume(face, across)
+        form = jit.form(volume(self.unknown) * self.weight * self.surface_measure(face))
+        return lambda: (integral(form) - start) / (start + caps)
 
     def lumen_pressure(self) -> float:
         """Return the pressure in the lumen, a load or an unknown. Collective."""
@@ -558,9 +560,7 @@ class Loading:
         if self.kinematics.subspace(self.space, component) is not None:
             self._prescribe_facets(self.domain.facets(face), component, value)
 
-    def _prescribe_facets(
-        self, facets: NDArray[np.int32], component: int, value: Constant
-    ) -> None:
+    def _prescribe_facets(self, facets: NDArray[np.int32], component: int, value: Constant) -> None:
         subspace = self.kinematics.subspace(self.space, component)
         dimension = self.domain.mesh.topology.dim - 1
         dofs = dolfinx.fem.locate_dofs_topological(subspace, dimension, facets)

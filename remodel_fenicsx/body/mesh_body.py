@@ -632,10 +632,11 @@ class MeshBody(WalledMesh, Unloads, FileBody):
                 able = " or ".join(map(repr, HELD_ACROSS))
                 rule = f"must be {able} with loads.{LUMEN}: the lumen is closed by plane ends"
                 raise SceneError(f"supports.{face}.kind = {kind!r}: {rule}")
-        moving = {"elongation", *(n for n, on in faces_of(loads).items() if on.face in ENDS)}
-        if not self.lumen(domain)[0].size and (moving := moving & {*loads}):
-            rule = f"not allowed with loads.{LUMEN}, because the normals of all ends lie in no plane"
-            raise SceneError(f"loads.{min(moving)}: {rule}")
+        moved = [name for name, on in faces_of(loads).items() if on.kind == "displacement"]
+        moved += {"elongation"} & {*loads}
+        if moved and not self.lumen(domain)[0].size:
+            rule = f"not allowed with loads.{LUMEN}: the normals of all ends lie in no plane"
+            raise SceneError(f"loads.{moved[0]}: {rule}")
 
     def lumen(self, domain: Domain) -> tuple[Array, float]:
         """Return `across` and `caps` of `Loading.add_lumen_expansion`. Collective."""

@@ -476,10 +476,10 @@ class LoadKind:
     reductions: tuple[str, ...] = ()
     value: Callable[[Any], float] | None = None
     makes_length_unknown: bool = False
-    makes_pressure_unknown: bool = False
     area: Callable[[Any], float] | None = None
     replaces: str = ""
     of_one_strain: bool = False
+    makes_pressure_unknown: bool = False
 
     def column_name(self, name: str) -> str:
         """Return the name of the column for the load of this name."""

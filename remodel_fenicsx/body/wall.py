@@ -148,17 +148,9 @@ def lumen_pressure(m: Any) -> float:
 
 def _expansion(m: Any) -> float:
     """Return V/V_0 - 1 of the lumen. Collective."""
-    from remodel_fenicsx.fem import jit
-    from remodel_fenicsx.fem.assembly import integral
-
-    def compiled() -> tuple[Any, float, float]:
-        loading, (across, caps) = m.state.loading, m.observer.shape.lumen(m.domain)
-        volume, start = loading.lumen_volume("inner", across)
-        measure = loading.surface_measure("inner")
-        return jit.form(volume(m.state.unknown) * loading.weight * measure), start, caps
-
-    form, start, caps = m.cached("expansion of the lumen", compiled)
-    return (integral(form) - start) / (start + caps)
+    lumen = partial(m.observer.shape.lumen, m.domain)
+    compiled = m.cached("lumen", lambda: m.state.loading.lumen_expansion("inner", *lumen()))
+    return float(compiled())
 
 
 LUMEN_EXPANSION = LoadKind(

@@ -443,9 +443,8 @@ def _support_force(equilibrium: Equilibrium, face: str) -> Callable[[], float]:
             "so that the force has no direction; choose a part of it, or another face"
         )
     if (potential := state.loading.supports[face]) is not None:
-        form = jit.form(
-            -ufl.derivative(potential(unknown), unknown, domain.of_parts(face, "normal"))
-        )
+        along = [*domain.of_parts(face, "normal"), *(len(unknown) - 3) * [0.0]]
+        form = jit.form(-ufl.derivative(potential(unknown), unknown, ufl.as_vector(along)))
         return lambda: integral(form)
     held: list[tuple[NDArray[np.int32], float]] = []
     for part, facets in domain.facets_of_parts(face):

@@ -342,7 +342,10 @@ class Scene(Table):
                     f"the preset {preset!r} has the shapes {known}", "geometry.shape", shape
                 )
             base = merge_nested(base, presets.PRESETS[preset][shape])
-            base["loads"] = _not_replaced(base["loads"], own.get("loads"), SHAPES[shape].loads)
+            loads, kinds = base["loads"], SHAPES[shape].loads.items()
+            own_kinds = [kind for name, kind in kinds if presets.said(own, "loads", name)]
+            replaced = {kind.replaces for kind in own_kinds}
+            base["loads"] = {name: loads[name] for name in loads if name not in replaced}
         presets.without_coupling(base, own)
 
         def made(settings: Mapping[str, object]) -> Scene:
@@ -852,15 +855,6 @@ def _check_load_names(shape: str, loads: object) -> None:
                 f"loads.{known}" for known in names
             )
             raise validation_error(f"a {shape} has no such load; allowed: {listed}", key, load)
-
-
-def _not_replaced(
-    loads: Mapping[str, object], own: object, kinds: Mapping[str, LoadKind]
-) -> dict[str, object]:
-    """Return a preset's loads without those that the scene's own loads replace."""
-    names = {*own} & {*kinds} if isinstance(own, Mapping) else set()
-    replaced = {kinds[name].replaces for name in names}
-    return {name: load for name, load in loads.items() if name not in replaced}
 
 
 def _check_load_on_face(shape: type[Shape], name: str, load: Mapping[str, object]) -> None:

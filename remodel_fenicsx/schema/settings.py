@@ -1122,7 +1122,8 @@ def faces_of(loads: Mapping[str, object]) -> dict[str, OnFace]:
     tables = {name: dict(load) for name, load in loads.items() if isinstance(load, (Mapping, Load))}
     return {
         name: OnFace(
-            load["face"], kind if (kind := load.get("kind")) in get_args(FaceKind) else "pressure"
+            load["face"],
+            str(load["kind"]) if load.get("kind") in get_args(FaceKind) else "pressure",
         )
         for name, load in tables.items()
         if isinstance(load.get("face"), str)

@@ -76,7 +76,8 @@ class Inertia:
         """Count the eigenvalues of negative real part."""
         self._assemble()
         # CHOLMOD takes half of MUMPS's time.
-        if self.equilibrium.comm.size == 1 and self._definite.is_definite(self._symmetric):
+        alone = self.equilibrium.comm.size == 1 and not self._constraints
+        if alone and self._definite.is_definite(self._symmetric):
             return 0
         number = self._count_eigenvalues_below(self._symmetric) - self._constraints
         if number == 0 or not self._is_unsymmetric:

@@ -247,7 +247,7 @@ class GuardedNewton:
         # named method do not depend on the size.
         # PETSc's LU does not pivot, as a constraint needs.
         small = is_small(unknowns, is_reduced) and (is_reduced or settings.method == AUTO)
-        small = small and not kinematics.number_of_constraints
+        small &= not kinematics.number_of_constraints
         self._options = ProblemOptions(method_options(method, ranks, small), settings.petsc_options)
         self._uses_safe_change = (
             method == LAGGED

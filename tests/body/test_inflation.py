@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import logging
-from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -14,14 +13,14 @@ from remodel_fenicsx import SceneError
 from remodel_fenicsx.fem import jit
 from remodel_fenicsx.fem.assembly import integral
 from remodel_fenicsx.scene import scene_from_dict
-from tests.conftest import Cases
+from tests.conftest import Cases, slowly
 from tests.mesh_files import TUBE, write_tube
 from tests.runs import columns_of, goes_on, last_row, simulated
 from tests.values import isotropic, ramped
 
 VOLUME = "lumen_expansion"
 EXACT = {"relative_tolerance": 1e-13}
-FREE, CLOSED, CLAMPED = ({"ends": ends} for ends in ("free", "closed", "clamped"))
+CLOSED = {"ends": "closed"}
 REMODELS = {"law": "tensor", "coupling": "staggered"}
 
 
@@ -61,16 +60,14 @@ STRETCHED = ramped(3.0, pressure=2.0, elongation=0.1)
 PULLED = ramped(3.0, pressure=2.0, axial_force=1.0)
 
 
-@pytest.mark.parametrize("supports", [FREE, CLOSED, CLAMPED], ids=lambda one: one["ends"])
-@pytest.mark.parametrize("kinematics", ["radial", "axisymmetric", "sector", "full"])
-def test_volume_is_pressure(
-    kinematics: str, supports: dict[str, str], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    if (kinematics, supports) == ("radial", CLAMPED):
-        pytest.skip("its sections differ")
+@pytest.mark.parametrize(("kinematics", "ends"), [
+    ("radial", "free"), ("radial", "closed"), ("axisymmetric", "clamped"), ("axisymmetric", "closed"),
+    ("sector", "clamped"), ("full", "free"), *slowly(("sector", "closed"), ("full", "closed")),
+])  # fmt: skip
+def test_volume_is_pressure(kinematics: str, ends: str, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("remodel_fenicsx.body.tube.PAPER", (8, 2, 2))
-    loads = ramped(3.0, pressure=2.0) if supports is CLOSED else STRETCHED
-    row = assert_same(tube(kinematics, loads, supports=supports))
+    loads = ramped(3.0, pressure=2.0) if ends == "closed" else STRETCHED
+    row = assert_same(tube(kinematics, loads, supports={"ends": ends}))
     assert row["pressure"][-1] == pytest.approx(2.0, rel=1e-8)
 
 
@@ -121,27 +118,22 @@ def bend(places: Any) -> Any:
     return np.stack([(8 + x) * np.cos(turn), y, (8 + x) * np.sin(turn)], axis=1)
 
 
-STIFF, HELD = {"kind": "guided", "stiffness": 1e7}, {"kind": "held"}
+OWN = own(TUBE, at_steps([0.1, 0.2, 0.4]))
+STIFF, HELD = {"kind": "guided", "stiffness": 1e5}, {"kind": "held"}
 FORCES = [f"support_force_{face}" for face in ("inlet", "outlet")]
 
 
 @pytest.mark.parametrize(
-    ("make", "loads", "support"),
-    [
-        (write_tube, STRETCHED, HELD),
-        (partial(write_tube, moved=bend), STRETCHED, STIFF),
-    ],
-    ids=["straight", "bent"],
+    ("moved", "support"), [(None, HELD), (bend, STIFF)], ids=["straight", "bent"]
 )
-def test_a_vessel_has_the_volume_that_is_asked(
-    tmp_path: Path, make: Any, loads: dict[str, Any], support: dict[str, Any]
-) -> None:
+def test_a_vessel_has_the_volume_that_is_asked(tmp_path: Path, moved: Any, support: Any) -> None:
     """That of its column, whose caps are flat, wherever the ends look and if one moves."""
     columns = {"columns": [VOLUME, "lumen_volume", "pressure", *FORCES], "fields": False}
     ends = {face: support for face in ("inlet", "outlet")}
-    found = assert_same(own(make(tmp_path / "a.msh"), loads, supports=ends, output=columns))
+    tables = {"supports": ends, "output": columns, "solver": {"relative_tolerance": 1e-11}}
+    found = assert_same(own(write_tube(tmp_path / "a.msh", moved=moved), STRETCHED, **tables))
     volume = found["lumen_volume"] / (1 + found[VOLUME])
-    np.testing.assert_allclose(volume, volume[0], rtol=1e-5)
+    np.testing.assert_allclose(volume, volume[0], rtol=1e-4)
 
 
 def test_ends_that_look_anywhere() -> None:
@@ -155,18 +147,15 @@ def test_ends_that_look_anywhere() -> None:
     assert changes[0] == pytest.approx(changes[1], rel=1e-3) and changes[1] > 1.0
 
 
-@pytest.mark.parametrize(
-    ("file", "tables", "words"),
-    [
-        ("tube", {"supports": {"outlet": {"kind": "free"}, "outer": {"kind": "held"}}}, "supports.outlet.kind = 'free': must be"),
-        ("tube", {"loads": ramped(3.0, lumen_expansion=0.1, pressure=1.0)}, r"loads.\w+ = .*: not allowed together"),
-        ("tube", {"solver": {"method": "iterative"}}, "solver.method = 'iterative': must be one of .*pressure is an"),
-        ("tube", {"loads": ramped(3.0, lumen_expansion=-1.0)}, "loads.lumen_expansion.value = -1.0: must be greater"),
-    ],
-)  # fmt: skip
-def test_what_is_refused(file: str, tables: dict[str, Any], words: str) -> None:
+@pytest.mark.parametrize(("tables", "words"), [
+    ({"supports": {"outlet": {"kind": "free"}, "outer": HELD}}, "supports.outlet.kind = 'free': must be"),
+    ({"loads": ramped(3.0, lumen_expansion=0.1, pressure=1.0)}, r"loads.\w+ = .*: not allowed together"),
+    ({"solver": {"method": "iterative"}}, "solver.method = 'iterative': must be one of .*pressure is an"),
+    ({"geometry": {"shape": "mesh", "file": str(TUBE), "is": "loaded"}}, "geometry.is = 'loaded': not allowed with"),
+])  # fmt: skip
+def test_what_is_refused(tables: dict[str, Any], words: str) -> None:
     with pytest.raises(SceneError, match=f"^{words}"):
-        last_row(own(TUBE, at_steps([0.1, 0.2, 0.3]), **tables))
+        last_row(OWN | tables)
 
 
 # ---------------------------------------------------------------- records and ranks
@@ -177,7 +166,6 @@ def test_a_run_goes_on(tmp_path: Path) -> None:
     assert goes_on(scene, tmp_path, 1.0, 2.0).history["pressure"][-1] > 0.1
 
 
-OWN = own(TUBE, at_steps([0.1, 0.2, 0.4]))
 ON_ONE_AND_TWO_RANKS = [
     {"scene": tube("axisymmetric", at_steps([0.1, 0.2, 0.4]), supports=CLOSED)},
     {"scene": OWN},
