@@ -290,12 +290,12 @@ class Loading:
         function, float
             Function of the unknown that returns UFL, and the integral at the start.
         """
-        mesh, kinematics, number = self.domain.mesh, self.kinematics, across.shape[1]
+        mesh, number = self.domain.mesh, across.shape[1]
         projection = dolfinx.fem.Constant(mesh, across @ across.T / max(number, 1))
         place, normal = ufl.SpatialCoordinate(mesh), ufl.FacetNormal(mesh)
 
         def volume(u: Function) -> Expr:
-            F, moved = kinematics.deformation_gradient(u), kinematics.displacement(u)
+            moved, F = self.kinematics.displacement(u), self.kinematics.deformation_gradient(u)
             end = ufl.cofac(F) * normal
             if number:
                 return -ufl.inner(projection * (place + moved), end)
@@ -562,7 +562,7 @@ class Loading:
 
     def _prescribe_facets(self, facets: NDArray[np.int32], component: int, value: Constant) -> None:
         subspace = self.kinematics.subspace(self.space, component)
-        dimension = self.domain.mesh.topology.dim - 1
+        dimension = self.domain.facet_tags.dim
         dofs = dolfinx.fem.locate_dofs_topological(subspace, dimension, facets)
         self.boundary_conditions.append(dolfinx.fem.dirichletbc(value, dofs, subspace))
 

@@ -43,7 +43,6 @@ from remodel_fenicsx.body.wall import (
     Walled,
     angle_columns,
     columns_on_request,
-    lumen_pressure,
 )
 from remodel_fenicsx.errors import UnreadableFile
 from remodel_fenicsx.model.axes import LocalAxes
@@ -65,6 +64,7 @@ if TYPE_CHECKING:
 
     from remodel_fenicsx.body.domain import Domain
     from remodel_fenicsx.body.loading import Loading
+    from remodel_fenicsx.body.mesh_domain import MeshDomain
     from remodel_fenicsx.fem.quadrature import Quadrature
 
 log = logging.getLogger(__name__)
@@ -567,7 +567,7 @@ class MeshBody(WalledMesh, Unloads, FileBody):
             lambda shape, loading, name: loading.add_follower_pressure(name, "inner"),
             "pressure on the deformed inner face",
             STRESS,
-            value=lumen_pressure,
+            value=lambda m: m.state.loading.lumen_pressure(),
             replaces="lumen_expansion",
         ),
         "elongation": LoadKind(
@@ -634,21 +634,21 @@ class MeshBody(WalledMesh, Unloads, FileBody):
                 raise SceneError(f"supports.{face}.kind = {kind!r}: {rule}")
         moved = [name for name, on in faces_of(loads).items() if on.kind == "displacement"]
         moved += {"elongation"} & {*loads}
-        if moved and not self.lumen(domain)[0].size:
+        across, _ = self.lumen(domain)  # type: ignore[arg-type]
+        if moved and not across.size:
             rule = f"not allowed with loads.{LUMEN}: the normals of all ends lie in no plane"
             raise SceneError(f"loads.{moved[0]}: {rule}")
 
-    def lumen(self, domain: Domain) -> tuple[Array, float]:
+    def lumen(self, domain: MeshDomain) -> tuple[Array, float]:
         """Return `across` and `caps` of `Loading.add_lumen_expansion`. Collective."""
-        body: Any = domain
-        ends = [part for face in ENDS for part in body.boundary.parts(face)]
-        if len(body.rims) != len(ends):
-            rule = f"the inner face has {len(body.rims)} rims for {len(ends)} ends"
+        ends = [part for face in ENDS for part in domain.boundary.parts(face)]
+        if len(domain.rims) != len(ends):
+            rule = f"the inner face has {len(domain.rims)} rims for {len(ends)} ends"
             raise SceneError(f"loads.{LUMEN}: {rule}, so that it encloses no lumen")
         _, sizes, directions = np.linalg.svd([part.normal for part in ends])
         across = directions[int((sizes > ONE_PLANE).sum()) :].T
         nodes = domain.gather_nodes(domain.mesh.geometry.x)
-        return across, 0.0 if across.size else body.caps(nodes)
+        return across, 0.0 if across.size else domain.caps(nodes)
 
 
 class Solid(FileBody):

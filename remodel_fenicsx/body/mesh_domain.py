@@ -68,12 +68,12 @@ class MeshDomain(Domain):
         volume, area = self.boundary.volume, self.area("inner") + self.area("outer")
         return 2 * volume / area if area else float(np.cbrt(volume))
 
-    def caps(self, places: Array | None) -> float:
+    def caps(self, nodes: Array | None) -> float:
         """Return the volume of cones from the origin to flat caps on the rims. Collective.
 
-        `places`: all nodes in input order on rank 0, None elsewhere.
+        `nodes`: positions of all nodes in input order on rank 0, None elsewhere.
         """
-        volumes = [] if places is None else [cap_volume(places, rim) for rim in self.rims]
+        volumes = [] if nodes is None else [cap_volume(nodes, rim) for rim in self.rims]
         return float(self.comm.bcast(sum(volumes)))
 
     def length(self) -> float:

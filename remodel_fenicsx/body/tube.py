@@ -36,7 +36,6 @@ from remodel_fenicsx.body.wall import (
     STRESSES,
     check_layers,
     columns_on_request,
-    lumen_pressure,
 )
 from remodel_fenicsx.model.cells import cylindrical_axes, structure_tensor
 from remodel_fenicsx.model.energy import TURNED_OVER
@@ -248,7 +247,7 @@ def _elongation(m: Any) -> float:
 
 def _of_the_end(name: str, m: Any) -> float:
     """Return `wall_force` or `reduced` of an `EndForce`."""
-    return float(getattr(m.end_force("inner"), name)(lumen_pressure(m)))
+    return float(getattr(m.end_force("inner"), name)(m.state.loading.lumen_pressure()))
 
 
 def _of_rings(release: str, m: Any) -> float:
@@ -348,7 +347,7 @@ class Tube(RoundWall):
             "pressure on the deformed inner face, and on the caps of closed ends",
             STRESS,
             reductions=tuple(REDUCTIONS),
-            value=lumen_pressure,
+            value=lambda m: m.state.loading.lumen_pressure(),
             replaces="lumen_expansion",
         ),
         "elongation": LoadKind(

@@ -141,18 +141,6 @@ def prestretch(natural: Natural, local_axes: LocalAxes, domain: Domain) -> Array
 # ---------------------------------------------------------------- the lumen
 
 
-def lumen_pressure(m: Any) -> float:
-    """Return the pressure of a measurement, a load or an unknown. Collective."""
-    return float(m.state.loading.lumen_pressure())
-
-
-def _expansion(m: Any) -> float:
-    """Return V/V_0 - 1 of the lumen. Collective."""
-    lumen = partial(m.observer.shape.lumen, m.domain)
-    compiled = m.cached("lumen", lambda: m.state.loading.lumen_expansion("inner", *lumen()))
-    return float(compiled())
-
-
 LUMEN_EXPANSION = LoadKind(
     lambda shape, loading, name: loading.add_lumen_expansion(
         name, "inner", *shape.lumen(loading.domain)
@@ -161,7 +149,10 @@ LUMEN_EXPANSION = LoadKind(
     "unknown, or computed",
     above=-1.0,
     reductions=("radial", "axisymmetric", "sector"),
-    value=_expansion,
+    value=lambda m: m.cached(
+        "lumen",
+        lambda: m.state.loading.lumen_expansion("inner", *m.observer.shape.lumen(m.domain)),
+    )(),
     makes_pressure_unknown=True,
     replaces="pressure",
 )

@@ -456,7 +456,8 @@ class _WithNumbers(_KinematicsWrapper):
     count: ClassVar[int] = 1
 
     def __init__(self, kinematics: Kinematics, body: Any, pressure_scale: float = 0.0):
-        self.field, self.body, self.pressure_scale = kinematics, body, pressure_scale
+        self.field, self.body = kinematics, body
+        self.pressure_scale = pressure_scale
 
     def unknown(self, mesh: Mesh, degree: int) -> Function:
         """Return the field and the numbers, zero. Collective."""

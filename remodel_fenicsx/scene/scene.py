@@ -342,7 +342,7 @@ class Scene(Table):
                     f"the preset {preset!r} has the shapes {known}", "geometry.shape", shape
                 )
             base = merge_nested(base, presets.PRESETS[preset][shape])
-            loads, kinds = base["loads"], SHAPES[shape].loads.items()
+            loads, kinds = base.get("loads", {}), SHAPES[shape].loads.items()
             own_kinds = [kind for name, kind in kinds if presets.said(own, "loads", name)]
             replaced = {kind.replaces for kind in own_kinds}
             base["loads"] = {name: loads[name] for name in loads if name not in replaced}

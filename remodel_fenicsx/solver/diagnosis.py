@@ -51,7 +51,7 @@ class Inertia:
     # converse holds for symmetric tangents only. With a follower pressure on an open face, such as
     # that of a strip under tension, the symmetric part may be indefinite although all eigenvalues
     # are positive. A prescribed volume adds a multiplier, and a negative eigenvalue that is not
-    # counted: the others tell whether the body is stable at this volume.
+    # counted. The body is stable at this volume if there is no further one.
 
     def __init__(self, equilibrium: Equilibrium):
         self.equilibrium = equilibrium
