@@ -18,7 +18,7 @@ from remodel_fenicsx.body.wall import RoundWall
 from remodel_fenicsx.errors import UnreadableFile
 from remodel_fenicsx.fem.assembly import raise_on_all_ranks
 from remodel_fenicsx.fem.formulations import FORMULATIONS
-from remodel_fenicsx.fem.kinematics import KINEMATICS, FreeLength, NaturalConfiguration
+from remodel_fenicsx.fem.kinematics import KINEMATICS, WITH_NUMBERS, NaturalConfiguration
 from remodel_fenicsx.fem.quadrature import Quadrature
 from remodel_fenicsx.model.axes import GROWTH, NATURAL_GRADIENT, LocalAxes
 from remodel_fenicsx.model.tensors import Array, Flags, stretch_tensor
@@ -100,7 +100,16 @@ def initial_states(scene: Scene, domain: Domain, fibres: Fibres) -> list[State]:
 def make_kinematics(scene: Scene, domain: Domain) -> Any:
     """Return the scene's kinematics on a stress-free mesh."""
     kinematics = KINEMATICS[scene.model.kinematics].for_mesh(domain.mesh, scene.geometry)
-    return FreeLength(kinematics, scene.geometry) if scene.has_free_length else kinematics
+    wrapper = WITH_NUMBERS.get((scene.has_free_length, scene.has_unknown_pressure))
+    if wrapper is None:
+        return kinematics
+    return wrapper(kinematics, scene.geometry, _largest_modulus(scene) / domain.size)
+
+
+def _largest_modulus(scene: Scene) -> float:
+    """Return lambda + 2 mu of the stiffest matrix in the body."""
+    matrices = [one.material for one in scene.properties().values()]
+    return max(material.lame_lambda + 2 * material.lame_mu for material in matrices)
 
 
 def make_state(
@@ -113,9 +122,7 @@ def make_state(
     """Make the state of a body with its supports and zero loads."""
     shape, loading = scene.geometry, Loading(domain, unknown, kinematics)
     shape.support(loading, scene.supports.ends, scene.loads)
-    matrices = [one.material for one in scene.properties().values()]
-    modulus = max(material.lame_lambda + 2 * material.lame_mu for material in matrices)
-    shape.hold_faces(loading, scene.supports.faces, modulus, scene.loads)
+    shape.hold_faces(loading, scene.supports.faces, _largest_modulus(scene), scene.loads)
     return State(unknown, kinematics, cells, loading, FORMULATIONS[scene.mesh.formulation])
 
 

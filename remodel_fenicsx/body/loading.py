@@ -84,7 +84,7 @@ class Loading:
         self.boundary_conditions: list[DirichletBC] = []
         self.values: LoadValues = {}
         self._setters: dict[str, list[Callable[[float], None]]] = {}
-        self._terms: list[Callable[[Function, Expr], ufl.Form]] = []
+        self._terms: list[Callable[[Function, ufl.Argument], ufl.Form]] = []
         self._potentials: list[Potential] = []
         self._begins: dict[int, str] = {}  # by component of uniform strain: first constrained face
         self.has_caps = False
@@ -171,12 +171,11 @@ class Loading:
             If the kinematics is not that of a mesh in three dimensions.
         """
         self._check_three_dimensional("fixed facets")
-        mesh = self.domain.mesh
-        value = dolfinx.fem.Constant(mesh, np.zeros(3, dtype=PETSc.ScalarType))
-        dofs = dolfinx.fem.locate_dofs_topological(self.space, mesh.topology.dim - 1, facets)
-        self.boundary_conditions.append(dolfinx.fem.dirichletbc(value, dofs, self.space))
-        if name is not None:
-            self._take(name, value, direction)
+        for component, scale in enumerate(np.broadcast_to(direction, 3)):
+            value = self.constant(0.0)
+            self._prescribe_facets(facets, component, value)
+            if name is not None:
+                self._take(name, value, float(scale))
 
     # ------------------------------------------------------------ loads
     def add_dead_force(
@@ -207,6 +206,23 @@ class Loading:
             return
         traction, measure = self.magnitude(name, 1.0 / self.area(face)), self.surface_measure(face)
         self.add_term(lambda u, v: -traction * v[component] * self.weight * measure)
+
+    def add_dead_traction(self, name: str, face: str, direction: Sequence[float]) -> None:
+        """Add a dead load: a force per reference area of a face, in a fixed direction.
+
+        Parameters
+        ----------
+        name
+            Name of the load. Its magnitude (`set`) is a stress.
+        face
+            Name of the face in `Domain.faces`.
+        direction
+            Direction of the force, of any length, (3,).
+        """
+        traction = dolfinx.fem.Constant(self.domain.mesh, np.zeros(3, dtype=PETSc.ScalarType))
+        self._take(name, traction, np.asarray(direction) / np.linalg.norm(direction))
+        measure = self.surface_measure(face)
+        self.add_term(lambda u, v: -ufl.inner(traction, v) * self.weight * measure)
 
     def add_follower_pressure(self, name: str, face: str) -> None:
         """Add a follower pressure: a pressure on the deformed face, against its outward normal.
@@ -252,6 +268,83 @@ class Loading:
             return pressure / 2 * ufl.inner(across, cofactor * normal) * self.weight * measure
 
         self.add_potential(potential)
+
+    def lumen_volume(self, face: str, across: Array) -> tuple[Callable[[Function], Expr], float]:
+        """Return the lumen's volume, per reference area of its face, and at the start. Collective.
+
+        The volume is -1 times the integral of P x . cof(F) N over the face. P projects to the
+        directions across the normals of all ends, over their number. So ends that stay in their
+        planes do not contribute. Without such a direction the volume lacks the cones from the
+        origin to the ends, which must not move. Its change is what the face sweeps on a straight
+        path, by Simpson's rule, which is exact.
+
+        Parameters
+        ----------
+        face
+            Name of the face in `Domain.faces`.
+        across
+            Unit vectors across the normals of all ends as columns, (3, n).
+
+        Returns
+        -------
+        function, float
+            Function of the unknown that returns UFL, and the integral at the start.
+        """
+        mesh, number = self.domain.mesh, across.shape[1]
+        projection = dolfinx.fem.Constant(mesh, across @ across.T / max(number, 1))
+        place, normal = ufl.SpatialCoordinate(mesh), ufl.FacetNormal(mesh)
+
+        def volume(u: Function) -> Expr:
+            moved, F = self.kinematics.displacement(u), self.kinematics.deformation_gradient(u)
+            end = ufl.cofac(F) * normal
+            if number:
+                return -ufl.inner(projection * (place + moved), end)
+            middle = ufl.cofac((F + ufl.Identity(3)) / 2) * normal
+            return -ufl.inner(place, normal) / 3 - ufl.inner(moved, normal + 4 * middle + end) / 6
+
+        at_start = volume(dolfinx.fem.Function(self.space)) * self.weight
+        return volume, integral(jit.form(at_start * self.surface_measure(face)))
+
+    def add_lumen_expansion(self, name: str, face: str, across: Array, caps: float = 0.0) -> None:
+        """Prescribe the volume of the lumen if its pressure is an unknown (`UnknownPressure`).
+
+        Parameters
+        ----------
+        name
+            Name of the load. Its magnitude (`set`) is V/V_0 - 1, without unit.
+        face, across
+            See `lumen_volume`.
+        caps
+            Volume of the cones from the origin to the ends, if `across` is empty.
+        """
+        pressure = getattr(self.kinematics, "lumen_pressure", None)
+        if pressure is None:
+            return
+        (present, start), area = self.lumen_volume(face, across), self.area(face)
+        change = self.magnitude(name, (start + caps) / area)
+        before, measure = self.constant(start / area), self.surface_measure(face)
+        normal, F = ufl.FacetNormal(self.domain.mesh), self.kinematics.deformation_gradient
+
+        def residual(u: Function, test: ufl.Argument) -> ufl.Form:
+            if self.has_caps:
+                work = ufl.derivative(present(u), u, test)
+            else:
+                work = -ufl.inner(ufl.cofac(F(u)) * normal, self.kinematics.displacement(test))
+            gap = present(u) - before - change
+            return -(pressure(u) * work + pressure(test) * gap) * self.weight * measure
+
+        self._terms.append(residual)
+
+    def lumen_expansion(self, face: str, across: Array, caps: float = 0.0) -> Callable[[], float]:
+        """Return a function for V/V_0 - 1 of the lumen; see `add_lumen_expansion`. Collective."""
+        volume, start = self.lumen_volume(face, across)
+        form = jit.form(volume(self.unknown) * self.weight * self.surface_measure(face))
+        return lambda: (integral(form) - start) / (start + caps)
+
+    def lumen_pressure(self) -> float:
+        """Return the pressure in the lumen, a load or an unknown. Collective."""
+        solved = getattr(self.kinematics, "pressure_value", None)
+        return self.values.get("pressure", 0.0) if solved is None else float(solved(self.unknown))
 
     def add_axial_force(self, name: str) -> None:
         """Add a force on the ends along z if the length is an unknown (`FreeLength`)."""
@@ -368,7 +461,7 @@ class Loading:
             form: ``lambda u, v: -ufl.inner(b, v) * dx`` is a body force b per reference volume.
             The derivative with respect to the unknown enters the tangent.
         """
-        self._terms.append(term)
+        self._terms.append(lambda u, test: term(u, self.kinematics.displacement(test)))
 
     def add_potential(self, potential: Potential) -> None:
         """Add any load as its potential, a function of the unknown that returns a UFL form."""
@@ -396,8 +489,7 @@ class Loading:
 
     def external_residual(self, test: ufl.Argument) -> ufl.Form | None:
         """Return minus the external virtual work, a UFL form, or None without loads."""
-        virtual = self.kinematics.displacement(test)
-        terms = [term(self.unknown, virtual) for term in self._terms]
+        terms = [term(self.unknown, test) for term in self._terms]
         potentials = self.residual_of_potentials(test)
         terms += [] if potentials is None else [potentials]
         return sum(terms) if terms else None
@@ -465,13 +557,13 @@ class Loading:
         )
 
     def _prescribe_face(self, face: str, component: int, value: Constant) -> None:
+        if self.kinematics.subspace(self.space, component) is not None:
+            self._prescribe_facets(self.domain.facets(face), component, value)
+
+    def _prescribe_facets(self, facets: NDArray[np.int32], component: int, value: Constant) -> None:
         subspace = self.kinematics.subspace(self.space, component)
-        if subspace is None:
-            return
-        topology = self.domain.mesh.topology
-        dofs = dolfinx.fem.locate_dofs_topological(
-            subspace, topology.dim - 1, self.domain.facets(face)
-        )
+        dimension = self.domain.facet_tags.dim
+        dofs = dolfinx.fem.locate_dofs_topological(subspace, dimension, facets)
         self.boundary_conditions.append(dolfinx.fem.dirichletbc(value, dofs, subspace))
 
 

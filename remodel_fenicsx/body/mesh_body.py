@@ -37,7 +37,13 @@ from remodel_fenicsx.body.shape import (
     WithRegions,
     cauchy_columns,
 )
-from remodel_fenicsx.body.wall import AngleOf, Walled, angle_columns, columns_on_request
+from remodel_fenicsx.body.wall import (
+    LUMEN_EXPANSION,
+    AngleOf,
+    Walled,
+    angle_columns,
+    columns_on_request,
+)
 from remodel_fenicsx.errors import UnreadableFile
 from remodel_fenicsx.model.axes import LocalAxes
 from remodel_fenicsx.model.cells import angle_to_axis
@@ -58,6 +64,7 @@ if TYPE_CHECKING:
 
     from remodel_fenicsx.body.domain import Domain
     from remodel_fenicsx.body.loading import Loading
+    from remodel_fenicsx.body.mesh_domain import MeshDomain
     from remodel_fenicsx.fem.quadrature import Quadrature
 
 log = logging.getLogger(__name__)
@@ -69,6 +76,9 @@ ON_FACES: dict[str, Callable[[str], LoadKind]] = {
     ),
     "displacement": lambda face: LoadKind(
         _by_hold_faces, f"displacement of the face {face} along its outward normal", LENGTH
+    ),
+    "traction": lambda face: LoadKind(
+        _by_hold_faces, f"dead traction on the face {face}, force per reference area", STRESS
     ),
 }
 Names = tuple[str | int, ...]
@@ -444,9 +454,9 @@ class FileBody(WithRegions, FromFile):
                         f"{key}: loads.{moved[face]} moves this face too; one of them is enough"
                     )
                 moved[face] = name
-            elif kind in HELD_ACROSS:
+            elif kind in (HELD_ACROSS if load == "pressure" else ("held",)):
                 raise SceneError(
-                    f"{key}: its support ({kind!r}) carries the pressure; must be a face that moves"
+                    f"{key}: its support ({kind!r}) carries the {load}; must be a face that moves"
                 )
 
     def hold_faces(
@@ -474,8 +484,12 @@ class FileBody(WithRegions, FromFile):
         for name, on in on_faces.items():
             if on.kind == "pressure":
                 loading.add_follower_pressure(name, on.face)
+            elif on.kind == "traction":
+                loading.add_dead_traction(name, on.face, loads[name].direction or ())
 
 
+ENDS, LUMEN = ("inlet", "outlet"), "lumen_expansion"
+ONE_PLANE = 1e-6  # singular value of unit normals in one plane; of meshes in single precision 1e-7
 NODES_AT_A_DEPTH = 1e-3  # tolerance of depth; nodes of a layer in a regular mesh agree to 1e-4
 
 
@@ -553,6 +567,8 @@ class MeshBody(WalledMesh, Unloads, FileBody):
             lambda shape, loading, name: loading.add_follower_pressure(name, "inner"),
             "pressure on the deformed inner face",
             STRESS,
+            value=lambda m: m.state.loading.lumen_pressure(),
+            replaces="lumen_expansion",
         ),
         "elongation": LoadKind(
             _by_hold_faces,
@@ -560,6 +576,7 @@ class MeshBody(WalledMesh, Unloads, FileBody):
             column="axial_elongation",
             above=-1.0,
         ),
+        "lumen_expansion": LUMEN_EXPANSION,
     }
     columns = (
         Column(
@@ -604,6 +621,34 @@ class MeshBody(WalledMesh, Unloads, FileBody):
     def supports_of(self, supports: Supports) -> dict[str, Support]:
         """Return the supports of the scene; by default inlet and outlet are guided."""
         return {"inlet": Support(), "outlet": Support()} | dict(supports)
+
+    def check_faces(self, domain: Domain, supports: Supports, loads: Loads) -> None:
+        """Check that a lumen of prescribed volume has an end on each rim, in its plane."""
+        super().check_faces(domain, supports, loads)
+        if LUMEN not in loads:
+            return
+        for face in ENDS:
+            if (kind := self.supports_of(supports)[face].kind) not in HELD_ACROSS:
+                able = " or ".join(map(repr, HELD_ACROSS))
+                rule = f"must be {able} with loads.{LUMEN}: the lumen is closed by plane ends"
+                raise SceneError(f"supports.{face}.kind = {kind!r}: {rule}")
+        moved = [name for name, on in faces_of(loads).items() if on.kind == "displacement"]
+        moved += {"elongation"} & {*loads}
+        across, _ = self.lumen(domain)  # type: ignore[arg-type]
+        if moved and not across.size:
+            rule = f"not allowed with loads.{LUMEN}: the normals of all ends lie in no plane"
+            raise SceneError(f"loads.{moved[0]}: {rule}")
+
+    def lumen(self, domain: MeshDomain) -> tuple[Array, float]:
+        """Return `across` and `caps` of `Loading.add_lumen_expansion`. Collective."""
+        ends = [part for face in ENDS for part in domain.boundary.parts(face)]
+        if len(domain.rims) != len(ends):
+            rule = f"the inner face has {len(domain.rims)} rims for {len(ends)} ends"
+            raise SceneError(f"loads.{LUMEN}: {rule}, so that it encloses no lumen")
+        _, sizes, directions = np.linalg.svd([part.normal for part in ends])
+        across = directions[int((sizes > ONE_PLANE).sum()) :].T
+        nodes = domain.gather_nodes(domain.mesh.geometry.x)
+        return across, 0.0 if across.size else domain.caps(nodes)
 
 
 class Solid(FileBody):

@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 
 from remodel_fenicsx.body.axes import harmonic, slopes
 from remodel_fenicsx.body.domain import Domain, cells_of, symbolic_mesh
-from remodel_fenicsx.body.mesh_faces import Boundary, Face, node_order, rims_of
+from remodel_fenicsx.body.mesh_faces import Boundary, Face, cap_volume, node_order, rims_of
 from remodel_fenicsx.body.loading import Loading
 from remodel_fenicsx.body.mesh_file import MeshFile
 from remodel_fenicsx.fem import jit
@@ -67,6 +67,14 @@ class MeshDomain(Domain):
         """Mean thickness of the wall from volume and face areas; without them a cube's side."""
         volume, area = self.boundary.volume, self.area("inner") + self.area("outer")
         return 2 * volume / area if area else float(np.cbrt(volume))
+
+    def caps(self, nodes: Array | None) -> float:
+        """Return the volume of cones from the origin to flat caps on the rims. Collective.
+
+        `nodes`: positions of all nodes in input order on rank 0, None elsewhere.
+        """
+        volumes = [] if nodes is None else [cap_volume(nodes, rim) for rim in self.rims]
+        return float(self.comm.bcast(sum(volumes)))
 
     def length(self) -> float:
         """Compute the length from inlet to outlet, or 0 for a body without either. Collective."""

@@ -341,7 +341,7 @@ def columns_of(
     of_loads = (
         kind.make_column(name)
         for name, kind in kinds.items()
-        if not kind.makes_length_unknown
+        if not (kind.makes_length_unknown or kind.makes_pressure_unknown)
         or loads is None
         or name in loads
         or kind.column_name(name) in requested
@@ -408,9 +408,9 @@ class LoadKind:
         Names of the reduced kinematics that can apply the load.
     value
         Function of a measurement that returns the column's value; default: the load's magnitude.
-    makes_length_unknown
-        Whether the load makes the body's length an unknown. In scenes without the load its column
-        is on request.
+    makes_length_unknown, makes_pressure_unknown
+        Whether the load makes the body's length, or the pressure in its lumen, an unknown. In
+        scenes without the load its column is on request.
     area
         For a force: function of the shape that returns the reference area that carries it.
     replaces
@@ -449,6 +449,7 @@ class LoadKind:
     area: Callable[[Any], float] | None = None
     replaces: str = ""
     of_one_strain: bool = False
+    makes_pressure_unknown: bool = False
 
     def column_name(self, name: str) -> str:
         """Return the name of the column for the load of this name."""

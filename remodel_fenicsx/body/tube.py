@@ -32,6 +32,7 @@ from remodel_fenicsx.body.wall import (
     RoundWall,
     Wall,
     angle_columns,
+    LUMEN_EXPANSION,
     STRESSES,
     check_layers,
     columns_on_request,
@@ -246,8 +247,7 @@ def _elongation(m: Any) -> float:
 
 def _of_the_end(name: str, m: Any) -> float:
     """Return `wall_force` or `reduced` of an `EndForce`."""
-    loads = m.state.loading.values
-    return float(getattr(m.end_force("inner"), name)(loads.get("pressure", 0.0)))
+    return float(getattr(m.end_force("inner"), name)(m.state.loading.lumen_pressure()))
 
 
 def _of_rings(release: str, m: Any) -> float:
@@ -336,7 +336,7 @@ class Tube(RoundWall):
     >>> body.depth(np.array([[2.0, 0.0, 4.0]]))  # through the wall
     array([0.5])
     >>> round(body.section_area, 4), list(body.loads)
-    (25.1327, ['pressure', 'elongation', 'axial_force'])
+    (25.1327, ['pressure', 'elongation', 'axial_force', 'lumen_expansion'])
     """
 
     loads = {
@@ -347,6 +347,8 @@ class Tube(RoundWall):
             "pressure on the deformed inner face, and on the caps of closed ends",
             STRESS,
             reductions=tuple(REDUCTIONS),
+            value=lambda m: m.state.loading.lumen_pressure(),
+            replaces="lumen_expansion",
         ),
         "elongation": LoadKind(
             lambda shape, loading, name: loading.add_prescribed_elongation(
@@ -368,6 +370,7 @@ class Tube(RoundWall):
             value=partial(_of_the_end, "wall_force"),
             area=lambda shape: shape.section_area,
         ),
+        "lumen_expansion": LUMEN_EXPANSION,
     }
     columns = (
         *(
@@ -529,6 +532,10 @@ class Tube(RoundWall):
         """Add the supports of free ends, and caps under the pressure."""
         self.hold(loading)
         loading.has_caps = True
+
+    def lumen(self, domain: Domain) -> tuple[Array, float]:
+        """Return `across` and `caps` of `Loading.add_lumen_expansion`."""
+        return np.eye(3)[:, :2], 0.0
 
     @property
     def axial_length(self) -> float:

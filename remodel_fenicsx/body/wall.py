@@ -12,7 +12,15 @@ from typing import Any, ClassVar, NamedTuple, TYPE_CHECKING
 import numpy as np
 
 from remodel_fenicsx.body.gmsh_model import mesh_length_problem
-from remodel_fenicsx.body.shape import Column, Columns, Regions, Unloads, WithAxes, WithRegions
+from remodel_fenicsx.body.shape import (
+    Column,
+    Columns,
+    LoadKind,
+    Regions,
+    Unloads,
+    WithAxes,
+    WithRegions,
+)
 from remodel_fenicsx.model.axes import LocalAxes
 from remodel_fenicsx.model.cells import pitch_angle, radial_fraction
 from remodel_fenicsx.model.energy import Tissue
@@ -128,6 +136,26 @@ def prestretch(natural: Natural, local_axes: LocalAxes, domain: Domain) -> Array
                 layer.prestretch.stretches
             )
     return stretches
+
+
+# ---------------------------------------------------------------- the lumen
+
+
+LUMEN_EXPANSION = LoadKind(
+    lambda shape, loading, name: loading.add_lumen_expansion(
+        name, "inner", *shape.lumen(loading.domain)
+    ),
+    "change of the lumen's volume over its reference volume: prescribed, with the pressure as an "
+    "unknown, or computed",
+    above=-1.0,
+    reductions=("radial", "axisymmetric", "sector"),
+    value=lambda m: m.cached(
+        "lumen",
+        lambda: m.state.loading.lumen_expansion("inner", *m.observer.shape.lumen(m.domain)),
+    )(),
+    makes_pressure_unknown=True,
+    replaces="pressure",
+)
 
 
 # ---------------------------------------------------------------- bodies with inner and outer face

@@ -55,6 +55,9 @@ class Kinematics(ABC):
         None.
     grows
         Whether the tissue's volume changes in time (`volume_ratio`).
+    number_of_constraints
+        Number of unknowns that are multipliers of constraints, such as the pressure at a
+        prescribed volume of the lumen. Each adds a negative eigenvalue to the tangent.
     cost
         Cost of a step per quadrature point, relative to a hexahedron, measured on the artery.
 
@@ -76,6 +79,7 @@ class Kinematics(ABC):
     cost: ClassVar[float] = 1.0
     closed_ring: Any = None
     grows: ClassVar[bool] = False
+    number_of_constraints: ClassVar[int] = 0
 
     def element(self, kind: str) -> str:
         """Return the kind of the mesh's elements for the kind that the scene sets."""
@@ -442,42 +446,37 @@ class NaturalConfiguration(_KinematicsWrapper):
         return ufl.det(self.initial) / ufl.det(self.gradient)
 
 
-# ---------------------------------------------------------------- the length as an unknown
+# ---------------------------------------------------------------- numbers as unknowns
 
 
-class FreeLength(_KinematicsWrapper):
-    """Body whose length is an unknown too, for a prescribed axial force or pressure on end caps."""
+class _WithNumbers(_KinematicsWrapper):
+    """Body with further unknowns, numbers with the unit of a length."""
 
     suits_multigrid = False  # GMRES with GAMG does not converge if a row is full
+    count: ClassVar[int] = 1
 
-    def __init__(self, kinematics: Kinematics, body: Any):
+    def __init__(self, kinematics: Kinematics, body: Any, pressure_scale: float = 0.0):
         self.field, self.body = kinematics, body
+        self.pressure_scale = pressure_scale
 
     def unknown(self, mesh: Mesh, degree: int) -> Function:
-        """Return (u, e), zero. Collective."""
+        """Return the field and the numbers, zero. Collective."""
         element = self.field.unknown(mesh, degree).function_space.ufl_element()
-        number = basix_ufl.element("DG", mesh.topology.cell_name(), 0)
-        space = fem.functionspace(mesh, basix_ufl.mixed_element([element, number]))
-        unknown = fem.Function(global_constant_space(space, 1), name="displacement")
-        nodes, self._dofs = unknown.function_space.sub(0).collapse()
+        numbers = self.count * [basix_ufl.element("DG", mesh.topology.cell_name(), 0)]
+        space = fem.functionspace(mesh, basix_ufl.mixed_element([element, *numbers]))
+        for component in range(1, self.count + 1):
+            space = global_constant_space(space, component)
+        nodes, self._dofs = space.sub(0).collapse()
         self._nodal = fem.Function(nodes)
-        self._length = _constant(mesh, self.body.axial_length)
-        return unknown
-
-    def length_change(self, unknown: Function) -> Expr:
-        """Return the change of length e, UFL, linear in the unknown."""
-        return ufl.split(unknown)[1]
+        return fem.Function(space, name="displacement")
 
     def displacement(self, unknown: Function) -> Expr:
-        """Return u + e z/length e_z."""
-        u, change = ufl.split(unknown)
-        z = ufl.SpatialCoordinate(unknown.ufl_function_space().mesh)[2]
-        return self.field.displacement(u) + ufl.as_vector([0.0, 0.0, change * z / self._length])
+        """Return the field's displacement."""
+        return self.field.displacement(ufl.split(unknown)[0])
 
     def deformation_gradient(self, unknown: Function) -> Expr:
-        """Return the field's F plus e/length along z."""
-        u, change = ufl.split(unknown)
-        return self.field.deformation_gradient(u) + _along(2, change / self._length)
+        """Return the field's F."""
+        return self.field.deformation_gradient(ufl.split(unknown)[0])
 
     def subspace(self, space: FunctionSpace, component: int) -> Any:
         """Return the field's subspace, or None."""
@@ -490,19 +489,84 @@ class FreeLength(_KinematicsWrapper):
     def nodal_displacement(self, unknown: Function) -> Array:
         """Return the displacement of the local nodes, (nodes, 3). Collective."""
         self._nodal.x.array[:] = unknown.x.array[self._dofs]
+        return self.field.nodal_displacement(self._nodal).copy()
+
+    def _number(self, unknown: Function, component: int) -> float:
+        """Return a number, the same on every rank. Collective."""
+        from mpi4py import MPI
+
+        space = unknown.function_space
+        dofs = space.sub(component).dofmap.list.flatten()
+        here = float(unknown.x.array[dofs[0]]) if len(dofs) else -np.inf
+        return float(space.mesh.comm.allreduce(here, MPI.MAX))
+
+
+class FreeLength(_WithNumbers):
+    """Body whose length is an unknown too, for a prescribed axial force or pressure on end caps."""
+
+    def unknown(self, mesh: Mesh, degree: int) -> Function:
+        """Return (u, e), zero. Collective."""
+        self._length = _constant(mesh, self.body.axial_length)
+        return super().unknown(mesh, degree)
+
+    def length_change(self, unknown: Function) -> Expr:
+        """Return the change of length e, UFL, linear in the unknown."""
+        return ufl.split(unknown)[1]
+
+    def displacement(self, unknown: Function) -> Expr:
+        """Return u + e z/length e_z."""
+        z = ufl.SpatialCoordinate(unknown.ufl_function_space().mesh)[2]
+        along = self.length_change(unknown) * z / self._length
+        return super().displacement(unknown) + ufl.as_vector([0.0, 0.0, along])
+
+    def deformation_gradient(self, unknown: Function) -> Expr:
+        """Return the field's F plus e/length along z."""
+        F = super().deformation_gradient(unknown)
+        return F + _along(2, self.length_change(unknown) / self._length)
+
+    def nodal_displacement(self, unknown: Function) -> Array:
+        """Return the displacement of the local nodes, (nodes, 3). Collective."""
         places: Array = self.nodal_space(unknown).tabulate_dof_coordinates()
-        displacement = self.field.nodal_displacement(self._nodal).copy()
+        displacement = super().nodal_displacement(unknown)
         displacement[:, 2] += self.strain_of_length(unknown) * places[:, 2]
         return displacement
 
     def strain_of_length(self, unknown: Function) -> float:
         """Return e/length, the same on every rank. Collective."""
-        from mpi4py import MPI
+        return self._number(unknown, 1) / self.body.axial_length
 
-        space = unknown.function_space
-        dofs = space.sub(1).dofmap.list.flatten()
-        here = float(unknown.x.array[dofs[0]]) if len(dofs) else -np.inf
-        return float(space.mesh.comm.allreduce(here, MPI.MAX)) / self.body.axial_length
+
+class UnknownPressure(_WithNumbers):
+    """Body whose lumen has a prescribed volume, by a pressure that is an unknown too."""
+
+    number_of_constraints = 1
+
+    def unknown(self, mesh: Mesh, degree: int) -> Function:
+        """Return the field and the pressure over its scale, zero. Collective."""
+        self._scale = _constant(mesh, self.pressure_scale)
+        return super().unknown(mesh, degree)
+
+    def lumen_pressure(self, unknown: Function) -> Expr:
+        """Return the pressure, UFL, linear in the unknown."""
+        return self._scale * ufl.split(unknown)[-1]
+
+    def pressure_value(self, unknown: Function) -> float:
+        """Return the pressure, the same on every rank. Collective."""
+        return self.pressure_scale * self._number(unknown, self.count)
+
+
+class UnknownLengthAndPressure(UnknownPressure, FreeLength):
+    """Body whose length and pressure in the lumen are unknowns too."""
+
+    count = 2
+
+
+WITH_NUMBERS = {
+    (True, False): FreeLength,
+    (False, True): UnknownPressure,
+    (True, True): UnknownLengthAndPressure,
+}
+"""Kinematics by whether the length and the pressure are unknowns."""
 
 
 def global_constant_space(space: FunctionSpace, component: int) -> FunctionSpace:

@@ -415,8 +415,6 @@ def _face_form(
 
 def _lumen_volume(observer: Observer) -> Callable[[], float]:
     """Return a function for -1/3 integral of x . cof(F) N over the inner face, plus flat caps."""
-    from remodel_fenicsx.body.mesh_faces import cap_volume
-
     domain: Any = observer.domain  # a `MeshDomain`
     state, mesh = observer.state, domain.mesh
     middle = domain.boundary.parts("inner")[0].centre
@@ -428,10 +426,8 @@ def _lumen_volume(observer: Observer) -> Callable[[], float]:
 
     def volume() -> float:
         displacement = state.gathered_displacement()
-        caps = 0.0
-        if displacement is not None:
-            caps = sum(cap_volume(nodes + displacement, rim) for rim in domain.rims)
-        enclosed = integral(form) + float(allreduce(domain.comm, caps, MPI.SUM))
+        places = None if displacement is None else nodes + displacement
+        enclosed = integral(form) + domain.caps(places)
         return enclosed if abs(enclosed) > NO_LUMEN * domain.size**3 else math.nan
 
     return volume
@@ -447,25 +443,26 @@ def _support_force(equilibrium: Equilibrium, face: str) -> Callable[[], float]:
             "so that the force has no direction; choose a part of it, or another face"
         )
     if (potential := state.loading.supports[face]) is not None:
-        form = jit.form(
-            -ufl.derivative(potential(unknown), unknown, domain.of_parts(face, "normal"))
-        )
+        along = [*domain.of_parts(face, "normal"), *(len(unknown) - 3) * [0.0]]
+        form = jit.form(-ufl.derivative(potential(unknown), unknown, ufl.as_vector(along)))
         return lambda: integral(form)
-    held: list[tuple[NDArray[np.int32], Array]] = []
+    held: list[tuple[NDArray[np.int32], float]] = []
     for part, facets in domain.facets_of_parts(face):
-        nodes = dolfinx.fem.locate_dofs_topological(unknown.function_space, 2, facets)
-        held.append((nodes[nodes < state.number_of_owned_unknowns // 3], part.normal))
+        for component, weight in enumerate(part.normal.tolist()):
+            subspace = state.kinematics.subspace(unknown.function_space, component)
+            dofs = dolfinx.fem.locate_dofs_topological(subspace, 2, facets)
+            held.append((dofs[dofs < state.number_of_owned_unknowns], weight))
 
     def out_of_balance() -> float:
         vectors = [unknown.x.petsc_vec.duplicate() for _ in range(2)]
         equilibrium.assemble_internal(vectors[0])
         equilibrium.assemble_external(vectors[1])
-        forces = (vectors[0].array + vectors[1].array).reshape(-1, 3)
+        forces = vectors[0].array + vectors[1].array
         for vector in vectors:
             vector.destroy()
         return float(
             allreduce(
-                domain.comm, sum(float((forces[n] @ normal).sum()) for n, normal in held), MPI.SUM
+                domain.comm, sum(weight * float(forces[n].sum()) for n, weight in held), MPI.SUM
             )
         )
 

@@ -104,6 +104,8 @@ def loaded_body(scene: Scene) -> Faults:
     key, value = "geometry.is", "loaded"
     if not isinstance(scene.geometry, Unloads):
         yield f"allowed only for the shapes {_shapes(Unloads)}", key, value
+    if scene.has_unknown_pressure:
+        yield "not allowed with loads.lumen_expansion: needs the pressure", key, value
     if scene.supports.ends == "clamped":
         yield "not allowed with supports.ends = 'clamped': the loaded radius would vary", key, value
     if measured := ", ".join(f"{in_region(name)}cells.fibres" for name in scene.measured_cells):
@@ -358,14 +360,15 @@ def equilibrium(scene: Scene) -> Faults:
 
 
 def unknown_length(scene: Scene) -> Faults:
-    """Check that an unknown length is solved without multigrid, which cannot include it."""
+    """Check that unknown numbers are solved without multigrid, which cannot include them."""
     method = scene.solver.method
-    if scene.has_free_length and method == "iterative":
-        names = ", ".join(repr(name) for name in (AUTO, *SOLVER_METHODS) if name != method)
-        rule = (
-            f"must be one of {names} if the length is an unknown (loads.axial_force or closed ends)"
-        )
-        yield rule, "solver.method", method
+    for unknown, words in (
+        (scene.has_free_length, "length is an unknown (loads.axial_force or closed ends)"),
+        (scene.has_unknown_pressure, "pressure is an unknown (loads.lumen_expansion)"),
+    ):
+        if unknown and method == "iterative":
+            names = ", ".join(repr(name) for name in (AUTO, *SOLVER_METHODS) if name != method)
+            yield f"must be one of {names} if the {words}", "solver.method", method
 
 
 def times_of_output(scene: Scene) -> Faults:

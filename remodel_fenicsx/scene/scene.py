@@ -341,6 +341,10 @@ class Scene(Table):
                     f"the preset {preset!r} has the shapes {known}", "geometry.shape", shape
                 )
             base = merge_nested(base, presets.PRESETS[preset][shape])
+            loads, kinds = base.get("loads", {}), SHAPES[shape].loads.items()
+            own_kinds = [kind for name, kind in kinds if presets.said(own, "loads", name)]
+            replaced = {kind.replaces for kind in own_kinds}
+            base["loads"] = {name: loads[name] for name in loads if name not in replaced}
         presets.without_coupling(base, own)
 
         def made(settings: Mapping[str, object]) -> Scene:
@@ -563,6 +567,11 @@ class Scene(Table):
         return (
             self.supports.ends in shape.ends and shape.ends[self.supports.ends].makes_length_unknown
         ) or any(kinds[name].makes_length_unknown for name in self.loads)
+
+    @property
+    def has_unknown_pressure(self) -> bool:
+        """Whether the pressure in the lumen is an unknown, because its volume is prescribed."""
+        return any(self.load_kinds[name].makes_pressure_unknown for name in self.loads)
 
     def summary(self) -> str:
         """Describe stiffness of network and matrix and largest loads on one line, in one unit."""
@@ -1008,11 +1017,11 @@ def check_continuation(old: Scene, new: Scene, time: float) -> None:
             raise SceneError(f"{key} = {format_value(now.get(key))}: was {was}; {rule}")
     for name in {**old.load_kinds, **new.load_kinds}:
         first, second = old.loads.get(name), new.loads.get(name)
-        if first and second and first.face != second.face:
-            raise SceneError(
-                f"loads.{name}.face = {format_value(second.face)}: "
-                f"was {format_value(first.face)}; {rule}"
-            )
+        for key in ("face", "kind", "direction") if first and second else ():
+            was, value = getattr(first, key), getattr(second, key)
+            if was != value:
+                words = f"loads.{name}.{key} = {format_value(value)}: was {format_value(was)}"
+                raise SceneError(f"{words}; {rule}")
         for moment in sorted({0.0, time, *_ramp_times(first), *_ramp_times(second)}):
             old_value, value = (
                 0.0 if one is None else one.value * one.factor(moment) for one in (first, second)

@@ -13,7 +13,7 @@ import math
 import re
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Annotated, Any, Literal, NamedTuple, NoReturn, Optional
+from typing import TYPE_CHECKING, Annotated, Any, Literal, NamedTuple, NoReturn, Optional, get_args
 
 import numpy as np
 from numpy.typing import NDArray
@@ -972,6 +972,9 @@ Ramp = Annotated[
 ]
 
 
+FaceKind = Literal["pressure", "displacement", "traction"]
+
+
 class Load(Table):
     """Load by name: `force` of cube and tendon, `pressure` of a tube. Omitted loads are zero.
 
@@ -988,14 +991,18 @@ class Load(Table):
     last. Times up to time.end must be multiples of time.step. With time.tolerance a step ends at
     each time."""
 
-    kind: Literal["pressure", "displacement"] | None = None
+    kind: FaceKind | None = None
     """For a further load of a user-supplied body: 'pressure' acts against the outward normal of the
     deformed face. 'displacement' moves a held, guided or sliding face along its mean outward
-    normal."""
+    normal. 'traction' is a dead load, a force per reference area in a fixed `direction`."""
     face: str | None = Field(
         default=None, min_length=1, json_schema_extra={"allowed": "the name of a face"}
     )
     """For a further load of a user-supplied body: the face on which the load acts."""
+    direction: Annotated[tuple[float, float, float], IN_A_LIST] | None = Field(
+        default=None, json_schema_extra={"allowed": "a list of three numbers, not all 0"}
+    )
+    """For a 'traction': its direction along x, y and z, of any length."""
 
     def _faults(self) -> Faults:
         for index, (time, _) in enumerate(self.ramp):
@@ -1004,6 +1011,10 @@ class Load(Table):
             if index and time <= self.ramp[index - 1][0]:
                 rule = f"must exceed the previous entry's {format_value(self.ramp[index - 1][0])}"
                 yield rule, f"ramp[{index}][0]", time
+        if (self.direction is None) == (self.kind == "traction"):
+            yield "must be set for kind = 'traction', and only for it", "direction", self.direction
+        if self.direction is not None and not any(self.direction):
+            yield "must not be 0", "direction", self.direction
         for given, missing in (("kind", "face"), ("face", "kind")):
             if getattr(self, given) is not None and getattr(self, missing) is None:
                 rule = f"missing; {given} = {format_value(getattr(self, given))} needs it"
@@ -1061,7 +1072,8 @@ def faces_of(loads: Mapping[str, object]) -> dict[str, OnFace]:
     tables = {name: dict(load) for name, load in loads.items() if isinstance(load, (Mapping, Load))}
     return {
         name: OnFace(
-            load["face"], "displacement" if load.get("kind") == "displacement" else "pressure"
+            load["face"],
+            str(load["kind"]) if load.get("kind") in get_args(FaceKind) else "pressure",
         )
         for name, load in tables.items()
         if isinstance(load.get("face"), str)

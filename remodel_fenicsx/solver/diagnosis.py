@@ -50,10 +50,12 @@ class Inertia:
     # A tangent whose symmetric part is positive definite has eigenvalues of positive real part. The
     # converse holds for symmetric tangents only. With a follower pressure on an open face, such as
     # that of a strip under tension, the symmetric part may be indefinite although all eigenvalues
-    # are positive.
+    # are positive. A prescribed volume adds a multiplier, and a negative eigenvalue that is not
+    # counted. The body is stable at this volume if there is no further one.
 
     def __init__(self, equilibrium: Equilibrium):
         self.equilibrium = equilibrium
+        self._constraints = equilibrium.state.kinematics.number_of_constraints
         self._tangent: PETSc.Mat | None = None
         self._symmetric: PETSc.Mat = None
         self._factorised: PETSc.Mat | None = None
@@ -74,9 +76,10 @@ class Inertia:
         """Count the eigenvalues of negative real part."""
         self._assemble()
         # CHOLMOD takes half of MUMPS's time.
-        if self.equilibrium.comm.size == 1 and self._definite.is_definite(self._symmetric):
+        alone = self.equilibrium.comm.size == 1 and not self._constraints
+        if alone and self._definite.is_definite(self._symmetric):
             return 0
-        number = self._count_eigenvalues_below(self._symmetric)
+        number = self._count_eigenvalues_below(self._symmetric) - self._constraints
         if number == 0 or not self._is_unsymmetric:
             return number
         wanted = 1
@@ -189,14 +192,14 @@ class Inertia:
         return matrix
 
     def _lower_bound(self, matrix: PETSc.Mat) -> float:
-        """Return a close lower bound of all eigenvalues, or zero if none is negative."""
-        if self._count_eigenvalues_below(matrix) == 0:
+        """Return a close lower bound of the eigenvalues that count, or zero if none is negative."""
+        if self._count_eigenvalues_below(matrix) <= self._constraints:
             return 0.0
         diagonal = matrix.getDiagonal()
         shift = -FIRST_SHIFT * float(np.abs(diagonal.min()[1]))
         diagonal.destroy()
         for _ in range(MOST_SHIFTS):
-            if self._count_eigenvalues_below(matrix, shift) == 0:
+            if self._count_eigenvalues_below(matrix, shift) <= self._constraints:
                 return shift
             shift *= SHIFT_FACTOR
         raise FactorisationFailed("no lower bound of the eigenvalues")
@@ -264,7 +267,7 @@ TOO_LARGE = FailureCause("", "try a smaller time.step, a slower ramp or lower lo
 LIMIT_POINT = FailureCause(
     "limit point",
     "the load approaches the largest that the body can carry; "
-    "lower it, or prescribe a displacement instead",
+    "lower it, or prescribe a displacement or loads.lumen_expansion instead",
 )
 BIFURCATION = FailureCause(
     "bifurcation",

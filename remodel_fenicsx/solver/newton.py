@@ -255,7 +255,9 @@ class GuardedNewton:
             self.method = method = cheaper_method(equilibrium)
         # In three dimensions PETSc's LU replaces MUMPS only with 'auto', so that the results of a
         # named method do not depend on the size.
+        # PETSc's LU does not pivot, as a constraint needs.
         small = is_small(unknowns, is_reduced) and (is_reduced or settings.method == AUTO)
+        small &= not kinematics.number_of_constraints
         self._options = ProblemOptions(method_options(method, ranks, small), settings.petsc_options)
         blocked = method == "iterative" and takes_levels(equilibrium, self._options)
         self._matrix = equilibrium.create_matrix(blocked)

@@ -221,8 +221,7 @@ class BucklingWarning(WarnsOnce):
     def thrust(self) -> float:
         """Return the thrust of wall and lumen along z. Collective."""
         thrust = -self._integral(self._derivative(ALONG)) / self._length()
-        loads = self.state.loading.values
-        pressure = loads.get("pressure", 0.0)
+        pressure = self.state.loading.lumen_pressure()
         return thrust if self.strut.inner_radius is None else thrust + pressure * self.lumen_area()
 
     def lumen_area(self) -> float:

@@ -83,6 +83,26 @@ def test_two_faces_are_moved_and_a_third_is_pressed(block: Path) -> None:
     )
 
 
+def test_a_traction_keeps_direction_and_force(block: Path) -> None:
+    """Along the normal it pulls as a dead force; aside the support bears traction times area, however it turns."""
+    load = {"kind": "traction", "face": "z1", "ramp": RAMP}
+    pulled = scene(block, {}, loads={"pull": load | {"value": 3.0, "direction": [0, 0, 2.0]}})
+    cube = Scene(
+        geometry={"shape": "cube", "side": 1.0}, cells={"initial": "isotropic"},
+        loads={"force": {"value": 3.0, "ramp": RAMP}}, time={"end": 6.0},
+        remodeling={"law": "tensor", "coupling": "staggered"},
+    )  # fmt: skip
+    for row, other in zip(rows_of(pulled), rows_of(cube), strict=True):
+        assert row["pull"] == other["force"]
+        assert row["support_force_z0"] == pytest.approx(other["force"], rel=1e-6)
+        assert row["volume"] == pytest.approx(other["min_jacobian"], rel=1e-4)
+    held = {"z0": {"kind": "held"}, "x0": {"kind": "free"}, "y0": {"kind": "free"}}
+    for direction, force in (([3.0, 0, 4.0], 0.8), ([1.0, 0, 0], 0.0)):
+        loads = {"push": load | {"value": 2.0, "direction": direction}}
+        row = last_row(scene(block, {}, loads=loads, supports=held))
+        assert row["support_force_z0"] == pytest.approx(2.0 * force, abs=1e-6)
+
+
 def test_a_run_goes_on(block: Path, tmp_path: Path) -> None:
     goes_on(scene(block, {"z1": 0.2}, time={"end": 3.0}), tmp_path, 2.0, 3.0)
 

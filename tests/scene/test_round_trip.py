@@ -54,7 +54,13 @@ def bases(tmp_path_factory: pytest.TempPathFactory) -> list[Scene]:
             {"geometry.length_unit": "mm", "geometry.is": "loaded", "time.end": "equilibrium"}
         ),
         scene_from_dict(mesh),
-        scene_from_dict({"geometry": {"shape": "solid", "file": str(file)}, "time": {"end": 3.0}}),
+        scene_from_dict(
+            {
+                "geometry": {"shape": "solid", "file": str(file)},
+                "loads": {"wall": LOAD | {"kind": "traction", "direction": [0.0, 0.0, 1.0]}},
+                "time": {"end": 3.0},
+            }
+        ),
         preset_scene("consistent", "tube").with_values(
             {"cells.initial": "isotropic", "regions": {"media": {"outer_radius": 2.0}, "rest": {}}}
         ),
