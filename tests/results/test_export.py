@@ -5,6 +5,7 @@ from __future__ import annotations
 import csv
 import re
 import xml.etree.ElementTree as ElementTree
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -17,6 +18,8 @@ from remodel_fenicsx import Recording, Scene, cli, run
 from remodel_fenicsx.body import tube
 from remodel_fenicsx.results.vtkhdf import TransientGrid, vtk_cells
 from tests.conftest import Refused
+from tests.mesh_files import NAMES, write_tube
+from tests.values import ramped
 
 RAMP = [[0.0, 0.0], [3.0, 1.0]]
 TUBE: dict[str, Any] = {
@@ -59,11 +62,11 @@ def exported(folder: Path, kind: str, *words: str) -> Path:
 
 
 @pytest.fixture(scope="module")
-def recorded(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def recorded(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
     """A run of two steps."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(tube, "PAPER", (8, 4, 1))
-        return run(Scene(**TUBE), tmp_path_factory.mktemp("export") / "run")
+        yield run(Scene(**TUBE), tmp_path_factory.mktemp("export") / "run")
 
 
 @pytest.fixture(params=MESHES)
@@ -119,6 +122,10 @@ class Solid:
         self.d: dict[int, list[float]] = {}
         self.dimensions: dict[int, list[float]] = {}
         self.kind = ""
+        self.parts: dict[str, list[int]] = {}
+        self.faces: dict[str, list[list[int]]] = {}
+        self.fixed: list[str] = []
+        self.pressures: dict[str, float] = {}
 
     def tensors(self) -> np.ndarray:
         """A of the elements by their number, which begins with 1."""
@@ -134,33 +141,65 @@ class Solid:
         )
 
 
+# Tags of the sections that are written, with their attributes, as the User Manual of FEBio 4 and FEBioXML
+# (FEBioMeshSection4, FEBioMeshDataSection4, FEBioBoundarySection3, FEBioLoadsSection4) name them.
+FEBIO_TAGS = {
+    "febio_spec": ("Mesh MeshData Boundary Loads LoadData", "version"),
+    "Mesh": ("Nodes Elements Surface NodeSet", ""),
+    "Nodes": ("node", "name"), "node": ("", "id"), "Elements": ("elem", "type name"),
+    "Surface": ("tri3 quad4 tri6 quad8", "name"), "NodeSet": ("", "name"),
+    **dict.fromkeys(("tri3", "quad4", "tri6", "quad8"), ("", "id")),
+    "MeshData": ("ElementData", ""), "ElementData": ("elem", "type elem_set name data_type"),
+    "elem": ("a d", "id lid"), "a": ("", ""), "d": ("", ""),
+    "Boundary": ("bc", ""), "bc": ("x_dof y_dof z_dof", "type node_set"),
+    **dict.fromkeys(("x_dof", "y_dof", "z_dof"), ("", "")),
+    "Loads": ("surface_load", ""), "surface_load": ("pressure", "type surface"), "pressure": ("", "lc"),
+    "LoadData": ("load_controller", ""), "load_controller": ("interpolate points", "id name type"),
+    "interpolate": ("", ""), "points": ("pt", ""), "pt": ("", ""),
+}  # fmt: skip
+FEBIO_TYPES = {
+    "Elements": ("tet4", "tet10", "hex8", "hex20"), "ElementData": ("mat_axis",), "bc": ("zero displacement",),
+    "surface_load": ("pressure",), "load_controller": ("loadcurve",),
+}  # fmt: skip
+
+
 def read_febio(path: Path) -> Solid:
-    """FEBio User Manual 4, Mesh and MeshData: lid counts the elements of the set, which the part gives its name."""
-    root = ElementTree.parse(path).getroot()
-    assert (root.tag, root.attrib["version"], [part.tag for part in root]) == (
-        "febio_spec",
-        "4.0",
-        ["Mesh", "MeshData"],
-    )
-    solid, (nodes, elements) = Solid(), root[0]
-    assert (nodes.tag, elements.tag) == ("Nodes", "Elements")
-    solid.nodes = {
-        int(node.attrib["id"]): numbers(node.text) for node in nodes if node.tag == "node"
-    }
-    solid.elements = {
-        int(e.attrib["id"]): [int(n) for n in (e.text or "").split(",")] for e in elements
-    }
-    solid.kind, part = elements.attrib["type"], list(solid.elements)
-    for data in root[1]:
-        assert (data.tag, data.attrib["elem_set"]) == ("ElementData", elements.attrib["name"])
+    """FEBio User Manual 4: lid counts the elements of the set, which the part gives its name."""
+    root, solid = ElementTree.parse(path).getroot(), Solid()
+    assert (root.tag, root.attrib["version"]) == ("febio_spec", "4.0")
+    assert [part.tag for part in root] == FEBIO_TAGS["febio_spec"][0].split()
+    for one in root.iter():
+        tags, attributes = (words.split() for words in FEBIO_TAGS[one.tag])
+        assert {part.tag for part in one} <= {*tags} and {*one.attrib} <= {*attributes}, one.tag
+        if "type" in one.attrib:
+            assert one.attrib["type"] in FEBIO_TYPES[one.tag]
+    solid.nodes = {int(node.attrib["id"]): numbers(node.text) for node in root.iter("node")}
+    for part in root.iter("Elements"):
+        of_part = {int(e.attrib["id"]): [int(n) for n in (e.text or "").split(",")] for e in part}
+        solid.parts[part.attrib["name"]] = [*of_part]
+        solid.elements |= of_part
+        solid.kind = part.attrib["type"]
+    for data in root.iter("ElementData"):
+        part_elements = solid.parts[data.attrib["elem_set"]]
         for one in data:
-            element = part[int(one.attrib["lid"]) - 1]
+            element = part_elements[int(one.attrib["lid"]) - 1]
             if data.attrib.get("type") == "mat_axis":
                 found = {axis.tag: numbers(axis.text) for axis in one}
                 solid.a[element], solid.d[element] = found["a"], found["d"]
             else:
                 assert data.attrib["data_type"] == "scalar"
                 solid.dimensions.setdefault(element, []).append(float(one.text or ""))
+    sets = {one.attrib["name"]: numbers(one.text) for one in root.iter("NodeSet")}
+    for surface in root.iter("Surface"):
+        facets = [[int(n) for n in numbers(facet.text)] for facet in surface]
+        assert {*sets[surface.attrib["name"]]} == {node for facet in facets for node in facet}
+        solid.faces[surface.attrib["name"]] = facets
+    solid.fixed = [bc.attrib["node_set"] for bc in root.iter("bc")]
+    assert all([dof.text for dof in bc] == ["1", "1", "1"] for bc in root.iter("bc"))
+    for load in root.iter("surface_load"):
+        (value,) = load
+        assert value.attrib["lc"] == next(root.iter("load_controller")).attrib["id"]
+        solid.pressures[load.attrib["surface"]] = float(value.text or "")
     return solid
 
 
@@ -169,32 +208,66 @@ def numbers(text: str | None) -> list[float]:
     return [float(word) for word in (text or "").split(",")]
 
 
+# corners of the sides of solids, from the Keywords Reference Guide: *SURFACE, TYPE=ELEMENT
+ABAQUS_SIDES = {
+    4: ["123", "142", "243", "341"],
+    8: ["1234", "5876", "1562", "2673", "3784", "4851"],
+}
+
+
 def read_abaqus(path: Path) -> Solid:
     """Abaqus Keywords Reference Guide: keyword lines, data lines, ** comments; after a comma a data line goes on."""
     solid, text = Solid(), path.read_text()
     assert text.isascii() and max(map(len, text.splitlines())) <= 256
-    blocks = re.findall(
+    assert max(line.count(",") for line in text.splitlines()) <= 16 and "\n\n" not in text
+    keywords = re.findall(
         r"^\*(\w[^,\n]*)(.*)\n((?:[^*].*\n)*)", re.sub(r"^\*\*.*\n", "", text, flags=re.M), re.M
     )
-    found = {keyword: body.replace(",\n", ",").splitlines() for keyword, _, body in blocks}
-    options = {keyword: said for keyword, said, _ in blocks}
-    rows = {keyword: [line.split(",") for line in lines] for keyword, lines in found.items()}
-    solid.kind = options["ELEMENT"].split("TYPE=")[1].split(",")[0]
+    rows: dict[str, list[list[str]]] = {}
+    for keyword, said, body in keywords:
+        options = dict(word.strip().split("=") for word in said.split(",") if "=" in word)
+        lines = [line.split(",") for line in re.sub(r",\n", ",", body).splitlines()]
+        rows[keyword] = lines
+        if keyword == "ELEMENT":
+            solid.kind, part = options["TYPE"], {
+                int(e): [int(n) for n in rest] for e, *rest in lines
+            }
+            solid.parts[options["ELSET"]] = [*part]
+            solid.elements |= part
+        elif keyword == "SURFACE":
+            assert options["TYPE"] == "ELEMENT"
+            corners = ABAQUS_SIDES[4 if solid.kind in ("C3D4", "C3D10") else 8]
+            solid.faces[options["NAME"]] = [
+                [solid.elements[int(e)][int(c) - 1] for c in corners[int(side.strip("S")) - 1]][
+                    ::-1
+                ]
+                for e, side in lines
+            ]
+        elif keyword == "NSET":
+            nodes = {int(n) for n in lines[0]}
+            assert nodes >= {n for facet in solid.faces[options["NSET"]] for n in facet}
+        elif keyword == "BOUNDARY":
+            assert [line[1:] for line in lines] == [["1", "3"]]
+            solid.fixed.append(lines[0][0])
+        elif keyword == "DSLOAD":
+            ((face, kind, value),) = lines
+            assert kind == "P"
+            solid.pressures[face] = float(value)
+        elif keyword == "DISTRIBUTION":
+            assert options["LOCATION"] == "ELEMENT"
+        elif keyword == "ORIENTATION":
+            assert options["DEFINITION"] == "COORDINATES"
+    assert rows["DISTRIBUTION TABLE"] == [["COORD3D", " COORD3D"]]
     solid.nodes = {int(line[0]): [float(x) for x in line[1:]] for line in rows["NODE"]}
-    solid.elements = {int(line[0]): [int(n) for n in line[1:]] for line in rows["ELEMENT"]}
-    assert (
-        found["DISTRIBUTION TABLE"] == ["COORD3D, COORD3D"]
-        and "LOCATION=ELEMENT" in options["DISTRIBUTION"]
-    )
-    assert "DEFINITION=COORDINATES" in options["ORIENTATION"]
     default, *axes = rows["DISTRIBUTION"]
     assert default[0] == "", "the first line is the default"
     for line in axes:
         values = [float(x) for x in line[1:]]
         solid.a[int(line[0])], solid.d[int(line[0])] = values[:3], values[3:]
-    for line in re.findall(r"^\*\* cell_dimensions,(\d.*)$", text, re.M):
-        element, *lengths = line.split(",")
-        solid.dimensions[int(element)] = [float(length) for length in lengths]
+    for body in re.findall(r"^\*\* cell_dimension_\d of .*\n((?:\*\* \d.*\n)*)", text, re.M):
+        for line in body.splitlines():
+            element, length = line.removeprefix("** ").split(",")
+            solid.dimensions.setdefault(int(element), []).append(float(length))
     return solid
 
 
@@ -241,6 +314,78 @@ def test_elements_are_those_of_the_mesh_and_have_their_nodes_in_order(
         assert (
             np.linalg.norm(places[:, node] - (ends[0] + ends[1]) / 2, axis=1) < 0.25 * chord
         ).all(), (node, i, j)
+
+
+@pytest.mark.parametrize(("kind", "reader"), [("febio", read_febio), ("abaqus", read_abaqus)])
+def test_faces_are_seen_from_outside_and_bear_the_pressure(
+    kind: str, reader: Any, start: Path
+) -> None:
+    """All boundary facets once; area vectors of a closed surface sum to zero, and enclose the volume of the prism."""
+    solid = reader(exported(start, kind))
+    assert set(solid.faces) == {"bottom", "top", "inner", "outer"} and solid.fixed == []
+    assert solid.pressures == {"inner": 0.0}  # at t = 0
+    nodes = np.array([solid.nodes.get(n, [np.nan] * 3) for n in range(max(solid.nodes) + 1)])
+    sizes = {name: 0.0 for name in solid.faces}
+    total, volume = np.zeros(3), 0.0
+    for name, facets in solid.faces.items():
+        corners = nodes[
+            np.array(facets)[:, : 3 if solid.kind in ("tet4", "tet10", "C3D4", "C3D10") else 4]
+        ]
+        vectors = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]) / 2
+        if corners.shape[1] == 4:
+            vectors = np.cross(corners[:, 2] - corners[:, 0], corners[:, 3] - corners[:, 1]) / 2
+        total += vectors.sum(axis=0)
+        volume += np.einsum("ni,ni->", vectors, corners.mean(axis=1)) / 3
+        sizes[name] = np.linalg.norm(vectors, axis=1).sum()
+    section = 4 * np.sin(np.pi / 4) * (3.0**2 - 1.0**2)
+    assert np.abs(total).max() < 1e-9 and volume == pytest.approx(section, rel=1e-9)
+    assert sizes["top"] == sizes["bottom"] == pytest.approx(section)
+    assert (
+        sizes["outer"] == pytest.approx(3 * sizes["inner"]) == pytest.approx(48 * np.sin(np.pi / 8))
+    )
+    for facets in solid.faces.values():  # nodes of edges lie between their corners
+        for facet in facets:
+            middles = nodes[facet[len(facet) // 2 :]] if len(facet) > 4 else []
+            for k, middle in enumerate(middles):
+                ends = nodes[facet[k]], nodes[facet[(k + 1) % len(middles)]]
+                assert np.linalg.norm(middle - sum(ends) / 2) < 0.25 * np.linalg.norm(
+                    ends[1] - ends[0]
+                )
+
+
+def test_regions_are_parts_and_ends_of_an_own_vessel_are_fixed(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Two layers and two loads at half their ramp; springs around the vessel are no condition; names become labels."""
+    tube_with_layers = TUBE | {"regions": {"media": {"outer_radius": 1.5}, "adventitia": {}}}
+    mesh = write_tube(tmp_path / "a.msh", "tetrahedron", renamed=NAMES | {"outer": "outside 1"})
+    own = {
+        "geometry": {"shape": "mesh", "file": str(mesh), "length_unit": "mm",
+                     "faces": {"outer": "outside 1"}},
+        "material": {"stress_unit": "kPa"},
+        "supports": {"outlet": {"kind": "held"}, "outer": {"kind": "elastic", "stiffness": 1.0}},
+        "loads": ramped(2.0, pressure=0.6) | {
+            "tissue": {"kind": "pressure", "face": "outer", "value": 0.2, "ramp": [[0.0, 0.0], [2.0, 1.0]]}},
+        "time": {"end": 1.0, "step": 1.0}, "cells": {"initial": "isotropic"},
+    }  # fmt: skip
+    monkeypatch.setattr(tube, "PAPER", (8, 4, 1))
+    layered = run(Scene(**tube_with_layers | {"time": {"end": 1.0}}), tmp_path / "layered")
+    vessel = run(Scene(**own), tmp_path / "vessel")
+    for kind, reader in (("febio", read_febio), ("abaqus", read_abaqus)):
+        solid = reader(exported(layered, kind))
+        radii = {
+            name: np.hypot(*solid.places().mean(axis=1)[np.array(rows) - 1, :2].T)
+            for name, rows in solid.parts.items()
+        }
+        assert radii["media"].max() < 1.5 < radii["adventitia"].min()
+        np.testing.assert_allclose(
+            solid.tensors(), recorded_tensors(Recording(layered), 1.0), rtol=0, atol=1e-6
+        )
+        path = exported(vessel, kind)
+        solid = reader(path)
+        assert sorted(solid.fixed) == ["inlet", "outlet"]
+        assert solid.pressures == {"inner": pytest.approx(0.3), "outer": pytest.approx(0.1)}
+        assert "lengths in mm, stresses in kPa" in path.read_text()
 
 
 def test_what_means_of_elements_leave_out_is_said(
