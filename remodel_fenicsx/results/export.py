@@ -236,10 +236,10 @@ def _model(program: str, path: Path, fibres: Fibres, recording: RecordedRun, tim
     for name, value in values_of_loads(scene.loads, time).items():
         if name in on_faces and on_faces[name].kind == "pressure":
             add("pressure", on_faces[name].face, value=value)
-    parts["nodes"] = [_rows(texts["node"], nodes + 1, fibres.points[nodes])]
-    filled = {key: "\n".join(parts[key]) for key in (*texts, "nodes")}
-    units = f"lengths in {unit_of(scene, 'length')}, stresses in {unit_of(scene, 'stress')}"
-    text = texts["document"].format(units=units, **filled)
+    parts["node"] = [_rows(texts["node"], nodes + 1, fibres.points[nodes])]
+    filled = {key: "\n".join(parts[key]) for key in texts}
+    filled["units"] = f"lengths: {unit_of(scene, 'length')}, stresses: {unit_of(scene, 'stress')}"
+    text = texts["document"].format(**filled)
     text = re.sub(rf"((?:\d+,){{{texts['per_line']}}})(?=\d)", r"\1\n", text)
     _write(path, re.sub(r"\n\n+", "\n", text))
 

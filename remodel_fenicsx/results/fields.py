@@ -74,14 +74,14 @@ class ElementFields:
         quadrature, mean_cells = measured.quadrature, cache(self.mean_cells)
         mean, nanmean = quadrature.element_mean, quadrature.element_nanmean
         stress = cache(lambda: mean(measured.stress))
-        principal = cache(lambda: np.linalg.eigvalsh(stress()))
+        principal = cache(lambda: np.asarray(np.linalg.eigvalsh(stress()), np.float64))
         makers: dict[str, Callable[[], Array]] = {
             "deformation_gradient": lambda: mean(measured.F).reshape(-1, 9),
             "cauchy_stress": lambda: stress().reshape(-1, 9),
             "hoop_stress": lambda: mean(measured.wall_stress[..., 0]),
             "axial_stress": lambda: mean(measured.wall_stress[..., 1]),
             "max_principal_stress": lambda: principal()[:, 2],
-            "von_mises_stress": lambda: np.sqrt(4.5) * np.asarray(principal().std(axis=1)),
+            "von_mises_stress": lambda: np.sqrt(4.5) * principal().std(axis=1),
             "cell_dimensions": lambda: mean_cells()[0],
             "fibre_angle": lambda: nanmean(measured.fibre_angle),
             UNLOADED: lambda: nanmean(measured.fibre_angle_unloaded),
