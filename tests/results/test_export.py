@@ -19,8 +19,8 @@ from remodel_fenicsx.body import tube
 from remodel_fenicsx.results.vtkhdf import TransientGrid, vtk_cells
 from tests.conftest import Refused
 from tests.mesh_files import NAMES, write_tube
+from tests.results.test_stress_on_the_body import SCENES
 from tests.tables import rows
-from tests.values import ramped
 
 RAMP = [[0.0, 0.0], [3.0, 1.0]]
 TUBE: dict[str, Any] = {
@@ -118,16 +118,9 @@ class Solid:
     """What a parser found: nodes by number, elements with their numbers of nodes, a and d and dimensions of each."""
 
     def __init__(self) -> None:
-        self.nodes: dict[int, list[float]] = {}
-        self.elements: dict[int, list[int]] = {}
-        self.a: dict[int, list[float]] = {}
-        self.d: dict[int, list[float]] = {}
-        self.dimensions: dict[int, list[float]] = {}
-        self.kind = ""
-        self.parts: dict[str, list[int]] = {}
-        self.faces: dict[str, list[list[int]]] = {}
-        self.fixed: list[str] = []
-        self.pressures: dict[str, float] = {}
+        self.nodes, self.elements, self.parts, self.faces = {}, {}, {}, {}
+        self.a, self.d, self.dimensions, self.pressures = {}, {}, {}, {}
+        self.fixed, self.kind = [], ""
 
     def tensors(self) -> np.ndarray:
         """A of the elements by their number, which begins with 1."""
@@ -282,14 +275,9 @@ def test_faces_close_around_the_body(kind: str, reader: Any, start: Path) -> Non
 def test_an_own_vessel_has_parts_fixed_ends_and_pressures(tmp_path: Path) -> None:
     """At half of the ramps; springs around it are no condition."""
     mesh = write_tube(tmp_path / "a.msh", "tetrahedron", renamed=NAMES | {"outer": "1 out"})
-    ramps = ramped(2.0, pressure=0.6, tissue=0.2)
-    values: dict[str, Any] = {
-        "geometry": {"shape": "mesh", "file": str(mesh), "length_unit": "mm", "faces": {"outer": "1 out"}},
-        "supports": {"outlet": {"kind": "held"}, "outer": {"kind": "elastic", "stiffness": 1.0}},
-        "loads": ramps | {"tissue": ramps["tissue"] | {"kind": "pressure", "face": "outer"}},
-        "time": {"end": 1.0, "step": 1.0}, "material": {"stress_unit": "kPa"},
-    }  # fmt: skip
-    vessel = run(Scene(**values), tmp_path / "run")
+    scene = SCENES["vessel"]
+    scene["geometry"]["file"] = str(mesh)
+    vessel = run(Scene(**scene), tmp_path / "run")
     for kind, reader in (("febio", read_febio), ("abaqus", read_abaqus)):
         solid = reader(path := exported(vessel, kind))
         assert len(solid.parts) == 1 and sorted(solid.fixed) == ["inlet", "outlet"]
