@@ -314,6 +314,8 @@ VIEWING = """
         right.
     --view VIEW = front  View from the front, from above, or from a direction: --view=X,Y,Z
         (default: %(default)s).
+    --field fibre_angle_deformed|hoop_stress|axial_stress|max_principal_stress|von_mises_stress
+        = fibre_angle_deformed  Colour the elements by this field (default: %(default)s).
     -o --output FILE  Output file; its suffix selects the format. Must not exist (default: {} in
         DIR, numbered if it exists)."""
 COMPUTES = (environment_problem,)
@@ -348,7 +350,7 @@ def _run(options: argparse.Namespace) -> None:
     if options.resume:
         folder = resume(options.resume, options.set, **wishes)
     else:
-        folder = run(options.scene, options.output, **wishes)
+        folder = run(options.scene, options.output, **wishes, overrides=options.set)
     _print(f"results in {folder}")
 
 
@@ -396,7 +398,7 @@ def _picture(options: argparse.Namespace) -> None:
     """Draw the body of the run in DIR as PNG or PDF."""
     from remodel_fenicsx.pictures import ViewOptions, draw_picture
 
-    viewing = ViewOptions(options.layers, options.cut, options.view)
+    viewing = ViewOptions(options.layers, options.cut, options.view, options.field)
     _print(draw_picture(options.folder, options.time, viewing, options.output))
 
 
@@ -413,7 +415,7 @@ def _animate(options: argparse.Namespace) -> None:
     """Animate the body of the run in DIR as GIF or WebP."""
     from remodel_fenicsx.pictures import ViewOptions, draw_animation
 
-    viewing = ViewOptions(options.layers, options.cut, options.view)
+    viewing = ViewOptions(options.layers, options.cut, options.view, options.field)
     _print(draw_animation(options.folder, options.frames, viewing, options.output))
 
 

@@ -34,8 +34,11 @@ from remodel_fenicsx.results.recording import (
     RecordedRun,
     VIEWS,
     kept_times,
+    unit_of,
+    words,
 )
 from remodel_fenicsx.results.whole_body import AXIS_FIELDS, WholeBody, chain_lines
+from remodel_fenicsx.schema.settings import STRESS_FIELDS
 from remodel_fenicsx.system.children import environment_of_child, last_line
 from remodel_fenicsx.system.files import TakenError, numbered, write_new
 
@@ -49,7 +52,7 @@ ANGLE = "fibre_angle_deformed"  # field that colours the bodies
 ANGLES = ("fibre_angle", ANGLE)  # fields in degrees, from 0 to 90
 # fields from which chains are drawn
 OF_TUBES = ("deformation_gradient", "cell_dimensions", *AXIS_FIELDS)
-SHOWN_FIELDS = ("displacement", ANGLE, *OF_TUBES)
+SHOWN_FIELDS = ("displacement", ANGLE, *OF_TUBES, *STRESS_FIELDS)
 NAN_COLOUR = "#999ea6"  # colour of points without a fibre angle
 LIFT = 0.03  # distance of chains above a face, which may be curved, over the width of the face
 LIGHT: dict[str, Any] = {"ambient": AMBIENT, "diffuse": 1 - AMBIENT, "specular": 0.0}
@@ -149,10 +152,12 @@ ZOOM = 0.8  # leaves space for the title
 
 
 class Job(NamedTuple):
-    """A drawing job: sheets of bodies with titles, view direction, and texts below them."""
+    """A drawing job: sheets of bodies with titles, view direction, field, and texts below them."""
 
     sheets: Sequence[Sequence[tuple[str, pyvista.UnstructuredGrid]]]
     direction: tuple[float, float, float]
+    field: str
+    limits: Sequence[float]
     scale: str
     notes: str
 
@@ -211,14 +216,15 @@ def _drawn(
     up = (0, 1, 0) if math.hypot(*job.direction[:2]) < 0.01 * abs(job.direction[2]) else (0, 0, 1)
     for number, (title, body) in enumerate(sheet):
         plotter.subplot(*divmod(number, columns))
-        actor = add_body(plotter, body, ANGLE, show_scalar_bar=False, line_width=0.5)
+        bare: Any = {"show_scalar_bar": False, "line_width": 0.5, "clim": job.limits}
+        actor = add_body(plotter, body, job.field, **bare)
         plotter.add_text(title, "upper_edge", LETTER, "black")
         plotter.enable_parallel_projection()
         plotter.view_vector(job.direction, up, bounds=bounds)
         plotter.camera.zoom(ZOOM)
     plotter.subplot(rows, 0)
     plotter.view_vector(job.direction, up)
-    look = {"n_labels": 7, "fmt": "%.0f", "color": "black", "label_font_size": LETTER}
+    look = {"n_labels": 7, "fmt": "%.3g", "color": "black", "label_font_size": LETTER}
     plotter.add_scalar_bar(
         job.scale,
         mapper=actor.mapper,
@@ -239,11 +245,12 @@ def _drawn(
 
 
 class ViewOptions(NamedTuple):
-    """View options of a picture: visible layers, cut and view direction."""
+    """View options of a picture: visible layers, cut, view direction and field."""
 
     layers: int | None = None
     cut: str | None = None
     view: str = "front"
+    field: str = ANGLE
 
     @property
     def direction(self) -> tuple[float, float, float]:
@@ -354,20 +361,25 @@ def _draw(
 ) -> Path:
     """Draw sheets, each with some times, and write them to a new file."""
     recording, shown = whole.recording, visible_elements(whole, viewing)
-    scene = recording.scene
-    if ANGLE not in recording.fields(sheets[0][0], {ANGLE}):
-        raise FigureError(f"{recording.path}: the run recorded no {ANGLE} (output.fields)")
+    scene, field = recording.scene, viewing.field
+    if field not in recording.fields(sheets[0][0], {field}):
+        raise FigureError(f"{recording.path}: the run recorded no {field} (output.fields)")
     drawn = [
         [(f"t = {t:g}", deformed(grid(whole, t, shown, SHOWN_FIELDS))) for t in times]
         for times in sheets
     ]
-    along, across = scene.geometry.angle_in_words
-    scale = f"angle of the collagen, deformed: 0 {along}, 90 {across} (degrees)"
+    label, (along, across) = "angle of the collagen", scene.geometry.angle_in_words
+    scale, limits = f"{label}, deformed: 0 {along}, 90 {across} (degrees)", [0.0, 90.0]
+    if field != ANGLE:
+        values = [body.cell_data[field] for sheet in drawn for _, body in sheet]
+        label, limits = words(field), [np.min(values), np.max(values)]
+        scale = f"{label}, means of elements {unit_of(scene, 'stress')}"
     notes = f"{scene.name}: {len(whole.elements):,} elements. "
     notes += " ".join(whole.notes("displacement" in drawn[0][0][1].point_data))
-    images = render(Job(drawn, viewing.direction, scale, textwrap.fill(notes, 110)))
+    look = viewing.direction, field, limits, scale, textwrap.fill(notes, 110)
+    images = render(Job(drawn, *look))
     first, *others = map(Image.fromarray, images)
-    texts, title = PngInfo(), f"{scene.name}: angle of the collagen"
+    texts, title = PngInfo(), f"{scene.name}: {label}"
     source = "; ".join(f"{name} {version}" for name, version in recording.versions.items())
     about = {
         "Title": title,

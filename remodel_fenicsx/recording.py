@@ -195,6 +195,7 @@ class Recording(RecordedRun):
     def screenshot(
         self, path: str | os.PathLike[str] | None = None, times: Sequence[float] | None = None, *,
         layers: int | None = None, cut: str | None = None, view: str = "front",
+        name: str = "fibre_angle_deformed",
     ) -> Path:  # fmt: skip
         """Draw the body into a file, like `remodel-fenicsx picture`, without a display.
 
@@ -210,6 +211,9 @@ class Recording(RecordedRun):
             See `plot`.
         view
             "front", "above" or "X,Y,Z": position of the viewer from the centre of the body.
+        name
+            Field that colours the elements: "fibre_angle_deformed", "hoop_stress", "axial_stress",
+            "max_principal_stress" or "von_mises_stress".
 
         Returns
         -------
@@ -229,9 +233,8 @@ class Recording(RecordedRun):
         """
         from remodel_fenicsx.pictures import ViewOptions, draw_picture
 
-        return draw_picture(
-            self.path, times, ViewOptions(layers, cut, view), None if path is None else Path(path)
-        )
+        viewing = ViewOptions(layers, cut, view, name)
+        return draw_picture(self.path, times, viewing, None if path is None else Path(path))
 
     def _time(self, time: float | None) -> float:
         """Return this time, or the last one by default."""

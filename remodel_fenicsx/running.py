@@ -42,7 +42,7 @@ from remodel_fenicsx.results.run_folder import (
     remove_partial_results,
     locked,
 )
-from remodel_fenicsx.results.status import BEGUN, FAILED, STOPPED
+from remodel_fenicsx.results.status import BEGUN, FAILED, OVERRIDE, STOPPED
 from remodel_fenicsx.results.vtkhdf import vtk_cells
 from remodel_fenicsx.scene import Scene, SceneError, read_scene, scene_from_dict
 from remodel_fenicsx.scene.scene import check_continuation, leaves
@@ -70,6 +70,7 @@ def run(
     deadline: float | None = None,
     report: bool = True,
     watchers: Sequence[Watcher | Callable[[Simulation], Watcher]] = (),
+    overrides: Sequence[str] = (),
 ) -> Path:
     """Run a scene and record the results.
 
@@ -90,6 +91,8 @@ def run(
     watchers
         Further watchers, or functions that make one from the `Simulation`. They see each step
         before it is recorded. Watchers for every run are in `extend.WATCHERS`.
+    overrides
+        "KEY=VALUE" with which the scene was read, for run.log and the report.
 
     Returns
     -------
@@ -128,6 +131,7 @@ def run(
     place = None if folder is None else chosen_folder(folder, scene.name, comm)
     with interrupts.StopRequest() as stop, ExitStack() as body:
         with buffer_log(comm.rank, quiet=quiet) as held:
+            _log_overrides(overrides)
             scene = body.enter_context(as_unloaded(scene, comm, quiet))
             stored = comm.bcast(
                 raise_on_all_ranks(
@@ -159,12 +163,18 @@ def resume(
     place = Path(folder)
     with interrupts.StopRequest() as stop, locked(place, comm, new=False), ExitStack() as body:
         with buffer_log(comm.rank, quiet=quiet) as held:
+            _log_overrides(overrides)
             scene, checkpoint = _read_run(place, overrides, comm)
             simulation = body.enter_context(_open_simulation(scene, comm))
             if comm.bcast(checkpoint is not None):
                 restore_state(simulation.state, checkpoint)
         _record(simulation, place, stop, held, quiet, deadline, report, resumes=True)
     return place
+
+
+def _log_overrides(overrides: Sequence[str]) -> None:
+    for override in overrides:
+        log.info(OVERRIDE + "%s", override)
 
 
 def _read_run(

@@ -5,6 +5,7 @@
 
 from __future__ import annotations
 
+import logging
 import re
 from abc import abstractmethod
 from collections.abc import Callable, Collection, Container, Iterable, Mapping, Sequence
@@ -41,6 +42,8 @@ if TYPE_CHECKING:
     from remodel_fenicsx.body.domain import Domain
     from remodel_fenicsx.body.loading import Loading
     from remodel_fenicsx.fem.quadrature import Quadrature
+
+log = logging.getLogger(__name__)
 
 Regions = Mapping[str, Region]
 Supports = Mapping[str, Support]
@@ -232,9 +235,38 @@ def _of_process(process: str, value: Callable[..., float], m: Any) -> float:
     return float(value(m.observer.stepper.process(process)))
 
 
+def _max_principal_stress(m: Any) -> float:
+    stress = np.linalg.eigvalsh(m.stress)[..., 2]
+    largest, position = m.quadrature.maximum(stress), m.quadrature.shown_place_of_largest(stress)
+    if m.domain.comm.rank == 0:
+        text = "time %g: largest principal stress %.6g at the reference position %s"
+        log.info(text, m.step.time, largest, position)
+    return float(largest)
+
+
+def _percentile_99_stress(m: Any) -> float:
+    values = np.linalg.eigvalsh(m.stress)[..., 2], np.linalg.det(m.F) * m.quadrature.volumes
+    parts = m.domain.comm.allgather([m.quadrature.owned(one).ravel() for one in values])
+    stress, volumes = np.concatenate(parts, axis=1)
+    return float(np.quantile(stress, 0.99, weights=volumes, method="inverted_cdf"))
+
+
 COLUMNS_ON_REQUEST: dict[str, Column] = {
     column.name: column
     for column in (
+        Column(
+            "max_principal_stress",
+            "stress",
+            "largest principal Cauchy stress of all integration points; run.log has its position",
+            _max_principal_stress,
+            extreme=True,
+        ),
+        Column(
+            "percentile_99_stress",
+            "stress",
+            "principal Cauchy stress that 99 % of the deformed volume do not exceed",
+            _percentile_99_stress,
+        ),
         Column(
             "pass_residual",
             "squared link length",

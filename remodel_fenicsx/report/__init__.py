@@ -47,15 +47,18 @@ from remodel_fenicsx.results.recording import (
     with_unit,
     words,
 )
-from remodel_fenicsx.results.status import log_entries, state_of
+from remodel_fenicsx.results.status import OVERRIDE, log_entries, state_of
 from remodel_fenicsx.results.whole_body import (
     AXIS_FIELDS,
     DIRECTION_FIELDS,
+    SECTORS,
     TENSOR_FIELDS,
     WholeBody,
     has_a_body,
 )
-from remodel_fenicsx.scene.scene import Scene, leaves, preset_scene
+from remodel_fenicsx.scene.presets import profile_for
+from remodel_fenicsx.scene.scene import leaves, preset_scene
+from remodel_fenicsx.schema.settings import STRESS_FIELDS
 from remodel_fenicsx.system.files import read_regular, write_new, write_whole
 from remodel_fenicsx.system.terminal import duration
 
@@ -136,9 +139,12 @@ def table(rows: Iterable[tuple[str, str]]) -> str:
 # ---------------------------------------------------------------- the body at the times of a page
 
 CELL = ("cell_dimensions", *AXIS_FIELDS)
-NAMES = ("displacement", "deformation_gradient", "fibre_angle_deformed", "chain_extension", *CELL)
+NAMES = (
+    *("displacement", "deformation_gradient", "fibre_angle_deformed", "chain_extension"),
+    *(*CELL, *STRESS_FIELDS),
+)
 TURNOVER_FIELDS = ("content", GROWTH)
-WALL_FIELDS = ("cauchy_stress", *DIRECTION_FIELDS, *TURNOVER_FIELDS)
+WALL_FIELDS = ("cauchy_stress", "station", *DIRECTION_FIELDS, *TURNOVER_FIELDS)
 
 
 @dataclass(frozen=True)
@@ -147,7 +153,6 @@ class ShownBody:
 
     whole: WholeBody
     times: Places
-    volume: Places
     # `position`, and recorded fields from `_of_elements` and `_of_layers`.
     series: dict[str, NDArray[np.float32]]
     is_deformed: bool
@@ -160,18 +165,17 @@ class ShownBody:
             *(WALL_FIELDS if isinstance(whole.recording.scene.geometry, Walled) else ()),
         )
         rows = defaultdict[str, list[NDArray[np.float32]]](list)
-        volume, is_deformed = _volumes(whole.points[whole.elements]), True
+        is_deformed = True
         for time in times:
             displacement, fields = whole.fields(float(time), names)
             is_deformed = displacement is not None
             moved = 0.0 if displacement is None else displacement
             rows["position"].append((whole.points + moved).astype(np.float32))
-            for name, values in (_of_elements(fields) | _of_layers(whole, volume, fields)).items():
+            for name, values in (_of_elements(fields) | _of_layers(whole, fields)).items():
                 rows[name].append(values.astype(np.float32))
         return cls(
             whole,
             times,
-            volume,
             {name: np.stack(values) for name, values in rows.items()},
             is_deformed,
         )
@@ -186,7 +190,7 @@ class ShownBody:
         arrays = {
             "elements": Array(self.whole.elements.astype(size)),
             "layer": Array(self.whole.layer.astype(np.uint8)),
-            "volume": Array(self.volume.astype(np.float32)),
+            "volume": Array(self.whole.volume.astype(np.float32)),
             "reference": Array(self.whole.points.astype(np.float32)),
             "position": Array(position, differences=True),
         }
@@ -200,6 +204,10 @@ class ShownBody:
         if "extension" in self.series:
             extension = np.rint(255 * self.series["extension"]).astype(np.uint8)
             arrays["extension"] = Array(extension, differences=True)
+        for name in (one for one in STRESS_FIELDS if one in self.series):
+            low, high = (float(bound(self.series[name])) for bound in (np.min, np.max))
+            levels = 255 * (self.series[name] - low) / (high - low or 1.0)
+            arrays[name], scales[name] = Array(np.rint(levels).astype(np.uint8), True), [low, high]
         if "edges" in self.series:
             edges = self.series["edges"].reshape(*moved.shape[:1], -1, 9)
             # Components are integers; 127 is the largest.
@@ -213,6 +221,7 @@ class ShownBody:
 def _of_elements(fields: dict[str, Places]) -> dict[str, Places]:
     """Return the recorded element fields by the names of `ShownBody.series`."""
     names = {"angle": "fibre_angle_deformed", "extension": "chain_extension"}
+    names |= {name: name for name in STRESS_FIELDS}
     series = {name: fields[field] for name, field in names.items() if field in fields}
     if set(CELL) <= set(fields):
         axes = np.stack([fields[name] for name in AXIS_FIELDS], axis=1)
@@ -222,20 +231,13 @@ def _of_elements(fields: dict[str, Places]) -> dict[str, Places]:
     return series
 
 
-def _of_layers(whole: WholeBody, volume: Places, fields: dict[str, Places]) -> dict[str, Places]:
-    """Return means by layer of recorded stress (around, along, across) and `TURNOVER_FIELDS`."""
-
-    def means(values: list[Places]) -> Places:
-        """Return volume means, (layers, values)."""
-        sums = [
-            np.bincount(whole.layer, weights=volume * part)
-            for part in (*values, np.ones_like(volume))
-        ]
-        return np.stack(sums[:-1], axis=1) / sums[-1][:, None]
-
-    unknown = np.full(len(volume), np.nan)
+def _of_layers(whole: WholeBody, fields: dict[str, Places]) -> dict[str, Places]:
+    """Return means by layer of recorded stress, also by sector, and of `TURNOVER_FIELDS`."""
+    unknown = np.full(len(whole.volume), np.nan)
     turnover = [fields.get(name, unknown) for name in TURNOVER_FIELDS]
-    series = {"content": means(turnover)} if set(TURNOVER_FIELDS) & set(fields) else {}
+    series = {"content": whole.means(turnover)} if set(TURNOVER_FIELDS) & set(fields) else {}
+    if {"hoop_stress", "station"} <= set(fields):
+        series["sectors"] = whole.by_sector(fields["hoop_stress"], fields["station"])
     shape = whole.recording.scene.geometry
     # Axes that are no function of the coordinates are recorded.
     recorded = DIRECTION_FIELDS if shape.constant_fields else ()
@@ -247,17 +249,7 @@ def _of_layers(whole: WholeBody, volume: Places, fields: dict[str, Places]) -> d
         axes = shape.axes_at(whole.centres)
     F, stress = (fields[name].reshape(-1, 3, 3) for name in TENSOR_FIELDS)
     moved = push_forward_axes(axes, F)
-    return series | {"stress": means([*np.einsum("nki,nij,nkj->kn", moved, stress, moved)])}
-
-
-def _volumes(corners: Places) -> Places:
-    """Return volume fractions of hexahedra (m, 8, 3), at their centres, or tetrahedra (m, 4, 3)."""
-    sides = corners[:, 1:4] - corners[:, :1]
-    if corners.shape[1] == 8:
-        grid = corners[:, [0, 1, 3, 2, 4, 5, 7, 6]].reshape(-1, 2, 2, 2, 3)
-        sides = np.stack([np.diff(grid, axis=k).mean(axis=(1, 2, 3)) for k in (1, 2, 3)], axis=1)
-    total = np.abs(np.linalg.det(sides))
-    return np.asarray(total / total.sum())
+    return series | {"stress": whole.means([*np.einsum("nki,nij,nkj->kn", moved, stress, moved)])}
 
 
 # ---------------------------------------------------------------- a run from its folder
@@ -394,6 +386,7 @@ def view(run: ReportedRun) -> Card:
         **scales, "times": body.times.tolist(), "layers": len(body.whole.depth),
         "words": shape.angle_in_words, "colours": ANGLE_COLOURS, "ambient": AMBIENT, "views": VIEWS,
         "chain": CHAIN_LOOK, "notes": " ".join(notes),
+        "unit": unit_of(run.recording.scene, "stress"),
         "least_extension": float(np.floor(20 * np.nanmin(body.series.get("extension", 0.0))) / 20),
     }  # fmt: skip
     return Card("view", data=data, arrays=arrays)
@@ -439,6 +432,15 @@ def stress(run: ReportedRun) -> Card | None:
         unit=unit,
         legend=legend,
     )
+
+
+def sectors(run: ReportedRun) -> Card | None:
+    """Plot hoop stress through the wall in sectors of a vessel's length."""
+    unit = unit_of(run.recording.scene, "stress")
+    names, label = [f"{k + 1} of {SECTORS}" for k in range(SECTORS)], f"hoop stress {unit}"
+    legend = "Means of layers in sectors of the length; 1 is at the inlet."
+    title = "Hoop stress by sector"
+    return _by_layer(run, "sectors", names, label, title=title, unit=unit, legend=legend)
 
 
 def content(run: ReportedRun) -> Card | None:
@@ -537,7 +539,7 @@ def facts(run: ReportedRun) -> Card:
         f"{match[1]} ranks" for text in texts if (match := _RANKS.match(text)) and match[1] != "1"
     ]
     tables["time"] += [steps, solving, *ranks[-1:]]
-    rows = {"changed": _changed(scene)} | {
+    rows = _changes(run) | {
         path.replace(".", " "): ", ".join(parts) for path, parts in tables.items()
     }
     return Card(
@@ -548,19 +550,26 @@ def facts(run: ReportedRun) -> Card:
     )
 
 
-def _changed(scene: Scene) -> str:
-    """Describe the keys whose values differ from the preset's, with both values."""
+def _changes(run: ReportedRun) -> dict[str, str]:
+    """Describe the keys whose values differ from the preset's, with both values, by origin."""
+    scene, changes = run.recording.scene, defaultdict[str, str](str)
     if scene.preset is None:
-        return ""
+        return changes
     preset = preset_scene(scene.preset, scene.geometry.name)
     before, now = (
         dict(leaves(each.model_dump(exclude_none=True), NO_PHYSICS)) for each in (preset, scene)
     )
-    new = {key: value for key, value in now.items() if before.get(key) != value}
-    return ", ".join(
-        f"{key} = {_as_text(value)} for {_as_text(before.get(key, '-'))}"
-        for key, value in new.items()
-    )
+    profile = profile_for(scene.profile, scene).settings(scene) if scene.profile else {}
+    texts = [text for _, _, text in run.log]
+    overrides = [text.partition("=")[0] + "." for text in texts if text.startswith(OVERRIDE)]
+    for key, value in now.items():
+        if before.get(key) != value:
+            origin = f"profile {scene.profile}" if key in profile else "in the scene"
+            if f"{OVERRIDE}{key}.".startswith(tuple(overrides)):
+                origin = "by --set"
+            text = f"{key} = {_as_text(value)} for {_as_text(before.get(key, '-'))}"
+            changes[f"changed {origin}"] += f", {text}"
+    return {origin: text.removeprefix(", ") for origin, text in changes.items()}
 
 
 def _as_text(value: object) -> str:
@@ -628,6 +637,7 @@ PAGE_PARTS: list[Part] = [
     angles,
     curves,
     stress,
+    sectors,
     content,
     facts,
     warnings,
@@ -679,7 +689,7 @@ def page_of(recording: RecordedRun, size: float = PAGE_SIZE) -> str:
     if not has_a_body(recording):
         return render_page(cards(ReportedRun(recording)))
     # Bytes of a recorded time, in base64.
-    of_a_time = 4 / 3 * RATIO * (6 * len(recording.points) + 11 * len(recording.elements))
+    of_a_time = 4 / 3 * RATIO * (6 * len(recording.points) + 15 * len(recording.elements))
     whole, most = WholeBody(recording), max(FEWEST_TIMES, int(1e6 * size / of_a_time))
     body = ShownBody.from_run(whole, kept_times(recording.times, most))
     return render_page(cards(ReportedRun(recording, body)))

@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 import logging
+import re
+import tomllib
+from collections import defaultdict
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from types import MappingProxyType
-from typing import NamedTuple
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -17,12 +20,14 @@ from remodel_fenicsx.fem.kinematics import KINEMATICS
 from remodel_fenicsx.model.axes import GROWTH, NATURAL_GRADIENT
 from remodel_fenicsx.model.cells import structure_tensor
 from remodel_fenicsx.model.energy import TURNED_OVER
-from remodel_fenicsx.results.recording import RecordedRun, RecordingError
-from remodel_fenicsx.results.whole_body import AXIS_FIELDS
+from remodel_fenicsx.results.recording import RecordedRun, RecordingError, unit_of
+from remodel_fenicsx.results.whole_body import AXIS_FIELDS, WholeBody
+from remodel_fenicsx.schema.settings import OnFace, Support, faces_of
 from remodel_fenicsx.system.files import write_new
 
 
 log = logging.getLogger(__name__)
+SECTORS_HEAD = "sector,hoop_stress_inner,hoop_stress_middle,hoop_stress_outer"
 LEAST_SAID = 0.01  # change between elements: a fit of angles does not resolve less
 
 
@@ -32,16 +37,14 @@ def write_vtu(
     cells: NDArray[np.int64],
     cell_type: int,
     cell_data: Mapping[str, ArrayLike],
-    point_data: Mapping[str, ArrayLike] = MappingProxyType({}),
+    point_data: Mapping[str, ArrayLike] | None = None,
 ) -> None:
     """Write a new file of one unstructured grid."""
     import meshio
     from meshio._vtk_common import vtk_to_meshio_type
 
     of_elements = {name: [np.asarray(values)] for name, values in cell_data.items()}
-    mesh = meshio.Mesh(
-        points, [(vtk_to_meshio_type[cell_type], cells)], dict(point_data), of_elements
-    )
+    mesh = meshio.Mesh(points, [(vtk_to_meshio_type[cell_type], cells)], point_data, of_elements)
     with TemporaryDirectory(prefix="remodel-fenicsx-") as folder:
         file = Path(folder) / "grid.vtu"
         meshio.write(file, mesh)
@@ -50,37 +53,17 @@ def write_vtu(
 
 # ---------------------------------------------------------------- cells as fibres of other programs
 # The cells of a recorded run as fibres of other programs: one structure tensor for each element.
-# This needs no dolfinx. Elements and nodes have the numbers of the run's mesh file, counted from 1
-# in text. The formats:
-# - febio: https://help.febio.org, User Manual 4, sections Mesh and MeshData; read by
-#   FEBioMeshDataSection4.cpp. Axis 1 is a, axis 2 lies in the plane of a and d. The cell dimensions
-#   are three data maps of the elements.
-# - abaqus: Keywords Reference Guide, *DISTRIBUTION TABLE, *DISTRIBUTION and *ORIENTATION, which
-#   CalculiX reads too (https://www.openaircraft.com/ccx-doc/ccx/node256.html). Neither has an item
-#   for the dimensions, which are comments: `** cell_dimensions, element, l1, l2, l3`.
+# Elements and nodes have the numbers of the run's mesh file, counted from 1 in text. Models of
+# other programs (programs.toml) have regions, faces, supports and pressures too, for which the body is
+# meshed again; other formats need no dolfinx.
 
 Array = NDArray[np.float64]
 
 TENSOR_COMPONENTS = tuple(f"{i}{j}" for i in "xyz" for j in "xyz")  # of a tensor, row by row
 
 
-class ElementNames(NamedTuple):
-    """Element type in other programs, and the number of its nodes in FEBio and Abaqus."""
-
-    vtk: int
-    febio: str
-    abaqus: str
-    nodes: int
-
-
-# by number of nodes. Other programs count the nodes within faces and volume of quadratic hexahedra
-# in other orders, and CalculiX has no such element: these programs get the element of 20 nodes
-ELEMENTS = {
-    4: ElementNames(10, "tet4", "C3D4", 4),
-    8: ElementNames(12, "hex8", "C3D8", 8),
-    10: ElementNames(24, "tet10", "C3D10", 10),
-    27: ElementNames(29, "hex20", "C3D20", 20),
-}
+PROGRAMS = tomllib.loads(Path(__file__).with_name("programs.toml").read_text(encoding="utf-8"))
+VTK_TYPES = {4: 10, 8: 12, 10: 24, 27: 29}  # by number of nodes
 
 
 @dataclass(frozen=True)
@@ -92,8 +75,8 @@ class Fibres:
     dimensions: Array
     axes: Array
     displacement: Array | None
-    # prestretch, content and natural length, if the run has any
-    others: Mapping[str, Array] = MappingProxyType({})
+    others: dict[str, Array]
+    """Prestretch, content and natural length, if the run has any."""
 
     @property
     def tensors(self) -> Array:
@@ -101,14 +84,15 @@ class Fibres:
         return structure_tensor(self.dimensions, self.axes)
 
     @property
-    def names(self) -> ElementNames:
-        """Names of the element type in other programs."""
-        return ELEMENTS[self.elements.shape[1]]
-
-    @property
     def reduced(self) -> NDArray[np.int64]:
         """Elements with the nodes that other programs use."""
-        return self.elements[:, : self.names.nodes]
+        # They count nodes within faces in other orders, and CalculiX has no such element.
+        return self.elements[:, :20]
+
+    @property
+    def values(self) -> dict[str, Array]:
+        """Values of the elements by name, besides their axes."""
+        return {f"cell_dimension_{i + 1}": self.dimensions[:, i] for i in range(3)} | self.others
 
 
 def export(
@@ -116,7 +100,8 @@ def export(
 ) -> Path:
     """Write the mean structure tensor of each element, its axes and dimensions to a new file."""
     ending, write = FIBRE_FORMATS[kind]
-    fibres = recorded_fibres(RecordedRun(folder), time)
+    recording = RecordedRun(folder)
+    fibres = recorded_fibres(recording, time)
     if fibres.others and kind not in WITH_OTHERS:
         kinds = " and ".join(WITH_OTHERS)
         log.warning(
@@ -130,7 +115,7 @@ def export(
             100 * share,
         )
     path = Path(folder) / f"fibres{ending}" if path is None else path
-    write(path, fibres)
+    write(path, fibres, recording, float(recording.times[-1]) if time is None else time)
     return path
 
 
@@ -176,111 +161,95 @@ def recorded_fibres(recording: RecordedRun, time: float | None = None) -> Fibres
 
 
 # ---------------------------------------------------------------- formats
-def _vtu(path: Path, fibres: Fibres) -> None:
+def _vtu(path: Path, fibres: Fibres, *_: object) -> None:
     of_elements = {
         "structure_tensor": fibres.tensors.reshape(-1, 9),
         "cell_dimensions": fibres.dimensions,
     }
-    of_elements |= {name: fibres.axes[:, i] for i, name in enumerate(AXIS_FIELDS)} | dict(
-        fibres.others
-    )
+    of_elements |= {name: fibres.axes[:, i] for i, name in enumerate(AXIS_FIELDS)} | fibres.others
     of_nodes = {} if fibres.displacement is None else {"displacement": fibres.displacement}
-    write_vtu(path, fibres.points, fibres.elements, fibres.names.vtk, of_elements, of_nodes)
+    kind = VTK_TYPES[fibres.elements.shape[1]]
+    write_vtu(path, fibres.points, fibres.elements, kind, of_elements, of_nodes)
 
 
-def _csv(path: Path, fibres: Fibres) -> None:
+def _csv(path: Path, fibres: Fibres, recording: RecordedRun, time: float) -> None:
     names = ["element", *"xyz", *(f"structure_tensor_{c}" for c in TENSOR_COMPONENTS)]
     names += [f"cell_dimension_{i}" for i in (1, 2, 3)]
     names += [f"{name}_{c}" for name in AXIS_FIELDS for c in "xyz"]
     centres = fibres.points[fibres.elements].mean(axis=1)
     rows = _rows("{0},{1},{2},{3},{4}", centres, fibres.tensors, fibres.dimensions, fibres.axes)
     _write(path, f"{','.join(names)}\n{rows}\n")
+    whole, shape = WholeBody(recording), recording.scene.geometry
+    _, fields = whole.fields(time, ("hoop_stress", "station"))
+    if "hoop_stress" in fields:
+        station = fields["station"] if "station" in fields else shape.station(whole.centres)
+        stress = whole.by_sector(fields["hoop_stress"], station)
+        middle = [np.interp(0.5, whole.depth, sector) for sector in stress.T]
+        rows = _rows("{0},{1}", np.stack([stress[0], middle, stress[-1]], axis=1))
+        _write(path.with_name("sectors.csv"), f"{SECTORS_HEAD}\n{rows}\n".replace("nan", ""))
 
 
-FEBIO = """<?xml version="1.0" encoding="UTF-8"?>
-<febio_spec version="4.0">
-<Mesh>
-<Nodes name="nodes">
-{nodes}
-</Nodes>
-<Elements type="{kind}" name="body">
-{elements}
-</Elements>
-</Mesh>
-<MeshData>
-<ElementData type="mat_axis" elem_set="body">
-{axes}
-</ElementData>
-{maps}
-</MeshData>
-</febio_spec>
-"""
-FEBIO_MAP = """<ElementData name="{name}" data_type="{kind}" elem_set="body">
-{values}
-</ElementData>"""
+def _model(program: str, path: Path, fibres: Fibres, recording: RecordedRun, time: float) -> None:
+    """Write the body with its regions, faces, supports and pressures for one of PROGRAMS."""
+    from dolfinx.mesh import entities_to_geometry
+    from mpi4py import MPI
 
+    from remodel_fenicsx.body.domain import cells_of
+    from remodel_fenicsx.body.loading import values_of_loads
 
-def _febio(path: Path, fibres: Fibres) -> None:
-    nodes, axes = np.unique(fibres.reduced), fibres.axes
-    maps = {f"cell_dimension_{i + 1}": fibres.dimensions[:, i] for i in range(3)} | dict(
-        fibres.others
-    )
-    kinds = {NATURAL_GRADIENT: "mat3"}
-    shown = [
-        FEBIO_MAP.format(
-            name=name,
-            kind=kinds.get(name, "scalar"),
-            values=_rows('<elem lid="{0}">{1}</elem>', values),
-        )
-        for name, values in maps.items()
-    ]
-    text = FEBIO.format(
-        kind=fibres.names.febio,
-        nodes=_rows('<node id="{1}">{2}</node>', nodes + 1, fibres.points[nodes]),
-        elements=_rows('<elem id="{0}">{1}</elem>', fibres.reduced + 1),
-        axes=_rows('<elem lid="{0}"><a>{1}</a><d>{2}</d></elem>', axes[:, 0], axes[:, 1]),
-        maps="\n".join(shown),
-    )
-    _write(path, text)
+    scene, supports = recording.scene, recording.scene.supports.faces
+    domain: Any = scene.geometry.build_with(scene.regions, scene.mesh, MPI.COMM_SELF)
+    if domain.number_of_elements != len(fibres.elements):
+        raise RecordingError(f"{recording.path}: the scene's mesh has other elements than the run")
+    region = domain.gather_elements(domain.element_region)
+    texts, elements, axes = PROGRAMS[program], fibres.reduced, fibres.axes
+    nodes, count = np.unique(elements), str(elements.shape[1])
+    kind, sides = PROGRAMS["elements"][count][program], np.array(PROGRAMS["sides"][count])
+    parts = defaultdict[str, list[str]](list)
 
+    def add(part: str, name: str, **values: object) -> None:
+        label = re.sub(r"\W|^(?=\d)", "_", name, flags=re.ASCII)
+        parts[part].append(texts[part].format(name=label, **values))
 
-ABAQUS = """** mean cells of a run of remodel_fenicsx: \
-local directions 1, 2 and 3 are the axes, longest first
-*NODE
-{nodes}
-*ELEMENT, TYPE={kind}, ELSET=BODY
-{elements}
-*DISTRIBUTION TABLE, NAME=CELL_AXES_TABLE
-COORD3D, COORD3D
-*DISTRIBUTION, NAME=CELL_AXES, LOCATION=ELEMENT, TABLE=CELL_AXES_TABLE
-,1.,0.,0.,0.,1.,0.
-{axes}
-*ORIENTATION, NAME=CELLS, DEFINITION=COORDINATES
-CELL_AXES
-** cell_dimensions, element, l1, l2, l3
-{dimensions}
-"""
-
-
-def _abaqus(path: Path, fibres: Fibres) -> None:
-    nodes, numbers = np.unique(fibres.reduced), fibres.reduced + 1
-    text = ABAQUS.format(
-        kind=fibres.names.abaqus,
-        nodes=_rows("{1},{2}", nodes + 1, fibres.points[nodes]),
-        # sixteen numbers in a line at most
-        elements=_rows("{0},{1},\n{2}", numbers[:, :15], numbers[:, 15:]),
-        axes=_rows("{0},{1}", fibres.axes[:, :2]),
-        dimensions=_rows("** cell_dimensions,{0},{1}", fibres.dimensions),
-    )
-    _write(path, text.replace(",\n\n", "\n"))
+    for name, number in domain.regions.items():
+        rows = np.flatnonzero(region == number)
+        add("part", name, kind=kind, rows=_rows(texts["element"], rows + 1, elements[rows] + 1))
+        add("local_axes", name, rows=_rows(texts["axes"], rows + 1, axes[rows, 0], axes[rows, 1]))
+        for key, values in fibres.values.items():
+            text = _rows(texts["value"], rows + 1, values[rows])
+            add("values", name, key=key, kind="mat3" if values.ndim > 1 else "scalar", rows=text)
+    for name in domain.faces:
+        local = domain.facets(name)
+        on_face = domain.node_number[entities_to_geometry(domain.mesh, 2, local)]
+        behind = domain.element_number[cells_of(domain.mesh, local)[0]]
+        nodes_of_sides = elements[behind][:, sides]
+        is_side = (nodes_of_sides[..., None] == on_face[:, None, None]).any(axis=3).all(axis=2)
+        facets, side = np.nonzero(is_side)
+        nodes_of_facets = nodes_of_sides[facets, side] + 1
+        pattern = texts["facets"][str(sides.shape[1])]
+        add("surface", name, rows=_rows(pattern, behind[facets] + 1, side + 1, nodes_of_facets))
+        add("node_set", name, nodes=",".join(map(str, np.unique(nodes_of_facets))))
+    for name in scene.geometry.held_faces(supports):
+        if supports.get(name, Support()).kind != "elastic":
+            add("fixed", name)
+    on_faces = {"pressure": OnFace("inner")} | faces_of(scene.loads)
+    for name, value in values_of_loads(scene.loads, time).items():
+        if name in on_faces and on_faces[name].kind == "pressure":
+            add("pressure", on_faces[name].face, value=value)
+    parts["node"] = [_rows(texts["node"], nodes + 1, fibres.points[nodes])]
+    filled = {key: "\n".join(parts[key]) for key in texts}
+    filled["units"] = f"lengths: {unit_of(scene, 'length')}, stresses: {unit_of(scene, 'stress')}"
+    text = texts["document"].format(**filled)
+    text = re.sub(rf"((?:\d+,){{{texts['per_line']}}})(?=\d)", r"\1\n", text)
+    _write(path, re.sub(r"\n\n+", "\n", text))
 
 
 WITH_OTHERS = ("vtu", "febio")
 # format: suffix of its files, and the function that writes one
-FIBRE_FORMATS: dict[str, tuple[str, Callable[[Path, Fibres], None]]] = {
+FIBRE_FORMATS: dict[str, tuple[str, Callable[..., None]]] = {
     "vtu": (".vtu", _vtu),
-    "febio": (".feb", _febio),
-    "abaqus": (".inp", _abaqus),
+    "febio": (".feb", partial(_model, "febio")),
+    "abaqus": (".inp", partial(_model, "abaqus")),
     "csv": (".csv", _csv),
 }
 

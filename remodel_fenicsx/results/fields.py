@@ -26,6 +26,7 @@ from remodel_fenicsx.schema.settings import (
     NO_PRESTRETCH,
     REGION,
     UNLOADED,
+    WALL_STRESSES,
 )
 from remodel_fenicsx.system.files import ClosedAtEnd
 
@@ -36,7 +37,7 @@ OF_ELEMENTS = tuple(name for name in FIELDS_BY_NAME if name not in ("displacemen
 
 def field_names(
     asked: bool | Sequence[str],
-    lacking: Collection[str] = (REGION, *NO_PRESTRETCH, *TURNED_OVER, GROWTH),
+    lacking: Collection[str] = (REGION, *NO_PRESTRETCH, *TURNED_OVER, GROWTH, *WALL_STRESSES),
     constant: Sequence[str] = (),
 ) -> tuple[str, ...]:
     """Return the fields that a scene's `output.fields` names; True is all that the scene has."""
@@ -72,9 +73,15 @@ class ElementFields:
         measured = Measurement(self.observer, None)  # type: ignore[arg-type]
         quadrature, mean_cells = measured.quadrature, cache(self.mean_cells)
         mean, nanmean = quadrature.element_mean, quadrature.element_nanmean
+        stress = cache(lambda: mean(measured.stress))
+        principal = cache(lambda: np.asarray(np.linalg.eigvalsh(stress()), np.float64))
         makers: dict[str, Callable[[], Array]] = {
             "deformation_gradient": lambda: mean(measured.F).reshape(-1, 9),
-            "cauchy_stress": lambda: mean(measured.stress).reshape(-1, 9),
+            "cauchy_stress": lambda: stress().reshape(-1, 9),
+            "hoop_stress": lambda: mean(measured.wall_stress[..., 0]),
+            "axial_stress": lambda: mean(measured.wall_stress[..., 1]),
+            "max_principal_stress": lambda: principal()[:, 2],
+            "von_mises_stress": lambda: np.sqrt(4.5) * principal().std(axis=1),
             "cell_dimensions": lambda: mean_cells()[0],
             "fibre_angle": lambda: nanmean(measured.fibre_angle),
             UNLOADED: lambda: nanmean(measured.fibre_angle_unloaded),

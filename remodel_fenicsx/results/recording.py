@@ -358,6 +358,8 @@ def _block(dataset: h5py.Dataset, start: int, length: int) -> Array:
 
 WORDS = {
     "max_chain_extension": "largest r/L",
+    "max_principal": "largest principal",
+    "von_mises": "von Mises",
     "min_jacobian": "smallest J",
     "seconds": "seconds a step",
 }

@@ -29,6 +29,7 @@ RECENT = 20  # steps whose mean is the rate
 # beginnings of the lines of run.log on a run's start and end
 BEGUN = "scene "
 FAILED, STOPPED = "failed: ", "ended: "
+OVERRIDE = "set by --set: "
 _LOG_ENTRY = re.compile(
     r"^(\d{4}-\d\d-\d\d \d\d:\d\d:\d\d)\S* ([A-Z]+) (.*?)\n?(?=^\d{4}-\d\d-|\Z)", re.M | re.S
 )

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Mapping
+from collections.abc import Collection, Mapping, Sequence
 from contextlib import ExitStack
 from pathlib import Path
 
@@ -24,6 +24,7 @@ Fields = tuple[Array | None, dict[str, Array]]
 CORNERS = {"interval": 2, "quadrilateral": 4, "tetrahedron": 4, "hexahedron": 8}
 MOST_LAYERS = 40  # of a mesh in layers; others are divided into FEW_LAYERS
 FEW_LAYERS = 8
+SECTORS = 8  # parts of a vessel's length, from inlet to outlet
 
 
 # ---------------------------------------------------------------- rotated fields of a reduction
@@ -149,6 +150,7 @@ class WholeBody:
         known = {} if self.is_turned else recording.fields(float(recording.times[0]), {"depth"})
         depth = known["depth"] if "depth" in known else shape.depth(self.centres)
         self.layer, self.depth = _layers(depth, self.elements)
+        self.volume = _volumes(self.points[self.elements])
 
     def notes(self, is_deformed: bool) -> list[str]:
         """Return notes for the captions of the body's pictures."""
@@ -165,12 +167,35 @@ class WholeBody:
         )
         return None if displacement is None else displacement[self._used], of_elements
 
+    def means(self, values: Sequence[Array], part: Numbers | int = 0, parts: int = 1) -> Array:
+        """Return means by volume in the layers, or in `parts` of each, (layers parts, values)."""
+        bins, number = parts * self.layer + part, parts * len(self.depth)
+        weighted = [self.volume * one for one in (*values, np.ones_like(self.volume))]
+        sums = np.stack([np.bincount(bins, one, number) for one in weighted], axis=1)
+        with np.errstate(invalid="ignore"):  # in parts without an element
+            return sums[:, :-1] / sums[:, -1:]
+
+    def by_sector(self, values: Array, station: Array) -> Array:
+        """Return means by layer and sector, from inlet to outlet, (layers, SECTORS)."""
+        sector = np.clip(SECTORS * station, 0, SECTORS - 1).astype(np.int64)
+        return self.means([values], sector, SECTORS).reshape(-1, SECTORS)
+
 
 def has_a_body(recording: RecordedRun) -> bool:
     """Return whether a run recorded fields of a body that can be shown."""
     scene = recording.scene
     reduction = scene.geometry.reductions.get(scene.model.kinematics)
     return bool(len(recording.times)) and (reduction is None or reduction.whole is not None)
+
+
+def _volumes(corners: Array) -> Array:
+    """Return volume fractions of hexahedra (m, 8, 3), at their centres, or tetrahedra (m, 4, 3)."""
+    sides = corners[:, 1:4] - corners[:, :1]
+    if corners.shape[1] == 8:
+        grid = corners[:, [0, 1, 3, 2, 4, 5, 7, 6]].reshape(-1, 2, 2, 2, 3)
+        sides = np.stack([np.diff(grid, axis=k).mean(axis=(1, 2, 3)) for k in (1, 2, 3)], axis=1)
+    total = np.abs(np.linalg.det(sides))
+    return np.asarray(total / total.sum())
 
 
 def _layers(depth: Array, elements: Numbers) -> tuple[Numbers, Array]:

@@ -22,7 +22,7 @@ from remodel_fenicsx._renamed import with_old_names
 from remodel_fenicsx.body import LoadKind, SHAPES, Shape
 from remodel_fenicsx.body.reductions import AUTO, choice
 from remodel_fenicsx.body.shape import Column, columns_of, columns_on_request
-from remodel_fenicsx.body.wall import RoundWall
+from remodel_fenicsx.body.wall import RoundWall, Walled
 from remodel_fenicsx.fem.formulations import FORMULATIONS, NOT_LOCKING
 from remodel_fenicsx.fem.kinematics import KINEMATICS
 from remodel_fenicsx.model.axes import GROWTH, NATURAL_GRADIENT
@@ -53,6 +53,7 @@ from remodel_fenicsx.schema.settings import (
     Supports,
     Time,
     UNLOADED,
+    WALL_STRESSES,
     faces_of,
 )
 from remodel_fenicsx.schema.tables import (
@@ -553,6 +554,11 @@ class Scene(Table):
         )
         reasons: list[tuple[bool, Sequence[str], str]] = [
             (not self.regions, (REGION,), "the scene has no regions"),
+            (
+                not isinstance(self.geometry, Walled),
+                WALL_STRESSES,
+                f"hoop and axial are directions of a wall; a {self.geometry.name} has none",
+            ),
             (same, (UNLOADED,), stress_free),
             (same and not self.remodeling.growth_key, (NATURAL_GRADIENT,), stress_free),
             (not processes, (*TURNED_OVER, GROWTH), "no process changes it"),

@@ -1226,10 +1226,13 @@ class Solver(Table):
             yield "must be greater than 0 if absolute_tolerance is 0", "relative_tolerance", 0.0
 
 
+WALL_STRESSES = ("hoop_stress", "axial_stress")  # fields of bodies with a wall
+STRESS_FIELDS = (*WALL_STRESSES, "max_principal_stress", "von_mises_stress")
 FIELDS_BY_NAME = (
     "displacement",
     "deformation_gradient",
     "cauchy_stress",
+    *STRESS_FIELDS,
     "cell_dimensions",
     "axis_1",
     "axis_2",

@@ -196,6 +196,7 @@ def test_what_was_run_has_all_that_makes_the_result(recorded: Recorded) -> None:
         "cells.initial = isotropic for random",
         "time.end = 3 for 150",
         "model.kinematics = radial for full",
+        "Changed by --set",
     ]
     assert not [words for words in [*expected, "ends free", "law explicit"] if words not in said]
     assert not [words for words in ("Output", "Solver", "turnover") if words in said]

@@ -5,6 +5,7 @@ from __future__ import annotations
 import csv
 import re
 import xml.etree.ElementTree as ElementTree
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -17,9 +18,13 @@ from remodel_fenicsx import Recording, Scene, cli, run
 from remodel_fenicsx.body import tube
 from remodel_fenicsx.results.vtkhdf import TransientGrid, vtk_cells
 from tests.conftest import Refused
+from tests.mesh_files import NAMES, write_tube
+from tests.results.test_stress_on_the_body import SCENES
+from tests.tables import rows
 
 RAMP = [[0.0, 0.0], [3.0, 1.0]]
 TUBE: dict[str, Any] = {
+    "regions": {"media": {"outer_radius": 1.5}, "adventitia": {}},
     "geometry": {"shape": "tube", "inner_radius": 1.0, "outer_radius": 3.0, "length": 1.0},
     "cells": {"initial": "random"},
     "loads": {"pressure": {"value": 2.4, "ramp": RAMP}, "elongation": {"value": 0.1, "ramp": RAMP}},
@@ -59,11 +64,11 @@ def exported(folder: Path, kind: str, *words: str) -> Path:
 
 
 @pytest.fixture(scope="module")
-def recorded(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def recorded(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
     """A run of two steps."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(tube, "PAPER", (8, 4, 1))
-        return run(Scene(**TUBE), tmp_path_factory.mktemp("export") / "run")
+        yield run(Scene(**TUBE), tmp_path_factory.mktemp("export") / "run")
 
 
 @pytest.fixture(params=MESHES)
@@ -113,12 +118,9 @@ class Solid:
     """What a parser found: nodes by number, elements with their numbers of nodes, a and d and dimensions of each."""
 
     def __init__(self) -> None:
-        self.nodes: dict[int, list[float]] = {}
-        self.elements: dict[int, list[int]] = {}
-        self.a: dict[int, list[float]] = {}
-        self.d: dict[int, list[float]] = {}
-        self.dimensions: dict[int, list[float]] = {}
-        self.kind = ""
+        self.nodes, self.elements, self.parts, self.faces = {}, {}, {}, {}
+        self.a, self.d, self.dimensions, self.pressures = {}, {}, {}, {}
+        self.fixed, self.kind = [], ""
 
     def tensors(self) -> np.ndarray:
         """A of the elements by their number, which begins with 1."""
@@ -135,32 +137,31 @@ class Solid:
 
 
 def read_febio(path: Path) -> Solid:
-    """FEBio User Manual 4, Mesh and MeshData: lid counts the elements of the set, which the part gives its name."""
-    root = ElementTree.parse(path).getroot()
-    assert (root.tag, root.attrib["version"], [part.tag for part in root]) == (
-        "febio_spec",
-        "4.0",
-        ["Mesh", "MeshData"],
-    )
-    solid, (nodes, elements) = Solid(), root[0]
-    assert (nodes.tag, elements.tag) == ("Nodes", "Elements")
-    solid.nodes = {
-        int(node.attrib["id"]): numbers(node.text) for node in nodes if node.tag == "node"
-    }
-    solid.elements = {
-        int(e.attrib["id"]): [int(n) for n in (e.text or "").split(",")] for e in elements
-    }
-    solid.kind, part = elements.attrib["type"], list(solid.elements)
-    for data in root[1]:
-        assert (data.tag, data.attrib["elem_set"]) == ("ElementData", elements.attrib["name"])
+    """FEBio User Manual 4 (names of tags in febio.txt): lid counts the elements of the set that a part names."""
+    root, solid = ElementTree.parse(path).getroot(), Solid()
+    known = {tag: names.split() for tag, names in rows(__file__, "febio.txt")}
+    for one in root.iter():
+        types = [one.attrib["type"].replace(" ", "-")] if "type" in one.attrib else []
+        assert {part.tag for part in one} | {*one.attrib} | {*types} <= {*known[one.tag]}, one.tag
+    solid.nodes = {int(node.attrib["id"]): numbers(node.text) for node in root.iter("node")}
+    for part in root.iter("Elements"):
+        of_part = {int(e.attrib["id"]): [*map(int, numbers(e.text))] for e in part}
+        solid.parts[part.attrib["name"]] = [*of_part]
+        solid.elements |= of_part
+        solid.kind = part.attrib["type"]
+    for data in root.iter("ElementData"):
         for one in data:
-            element = part[int(one.attrib["lid"]) - 1]
+            element = solid.parts[data.attrib["elem_set"]][int(one.attrib["lid"]) - 1]
             if data.attrib.get("type") == "mat_axis":
                 found = {axis.tag: numbers(axis.text) for axis in one}
                 solid.a[element], solid.d[element] = found["a"], found["d"]
             else:
-                assert data.attrib["data_type"] == "scalar"
                 solid.dimensions.setdefault(element, []).append(float(one.text or ""))
+    for surface in root.iter("Surface"):
+        solid.faces[surface.attrib["name"]] = [[*map(int, numbers(f.text))] for f in surface]
+    solid.fixed = [bc.attrib["node_set"] for bc in root.iter("bc")]
+    for load in root.iter("surface_load"):
+        solid.pressures[load.attrib["surface"]] = float(load[0].text or "")
     return solid
 
 
@@ -169,32 +170,44 @@ def numbers(text: str | None) -> list[float]:
     return [float(word) for word in (text or "").split(",")]
 
 
+# corners of the sides of solids, from the Keywords Reference Guide: *SURFACE, TYPE=ELEMENT
+ABAQUS_SIDES = {
+    4: ["123", "142", "243", "341"],
+    8: ["1234", "5876", "1562", "2673", "3784", "4851"],
+}
+
+
 def read_abaqus(path: Path) -> Solid:
     """Abaqus Keywords Reference Guide: keyword lines, data lines, ** comments; after a comma a data line goes on."""
     solid, text = Solid(), path.read_text()
-    assert text.isascii() and max(map(len, text.splitlines())) <= 256
-    blocks = re.findall(
+    assert max(line.count(",") for line in text.splitlines()) <= 16 and "\n\n" not in text
+    for keyword, said, body in re.findall(
         r"^\*(\w[^,\n]*)(.*)\n((?:[^*].*\n)*)", re.sub(r"^\*\*.*\n", "", text, flags=re.M), re.M
-    )
-    found = {keyword: body.replace(",\n", ",").splitlines() for keyword, _, body in blocks}
-    options = {keyword: said for keyword, said, _ in blocks}
-    rows = {keyword: [line.split(",") for line in lines] for keyword, lines in found.items()}
-    solid.kind = options["ELEMENT"].split("TYPE=")[1].split(",")[0]
-    solid.nodes = {int(line[0]): [float(x) for x in line[1:]] for line in rows["NODE"]}
-    solid.elements = {int(line[0]): [int(n) for n in line[1:]] for line in rows["ELEMENT"]}
-    assert (
-        found["DISTRIBUTION TABLE"] == ["COORD3D, COORD3D"]
-        and "LOCATION=ELEMENT" in options["DISTRIBUTION"]
-    )
-    assert "DEFINITION=COORDINATES" in options["ORIENTATION"]
-    default, *axes = rows["DISTRIBUTION"]
-    assert default[0] == "", "the first line is the default"
-    for line in axes:
-        values = [float(x) for x in line[1:]]
-        solid.a[int(line[0])], solid.d[int(line[0])] = values[:3], values[3:]
-    for line in re.findall(r"^\*\* cell_dimensions,(\d.*)$", text, re.M):
-        element, *lengths = line.split(",")
-        solid.dimensions[int(element)] = [float(length) for length in lengths]
+    ):
+        options = dict(word.strip().split("=") for word in said.split(",") if "=" in word)
+        lines = [line.split(",") for line in body.replace(",\n", ",").splitlines()]
+        if keyword == "NODE":
+            solid.nodes = {int(n): [*map(float, place)] for n, *place in lines}
+        elif keyword == "ELEMENT":
+            solid.kind, part = options["TYPE"], {int(e): [*map(int, nodes)] for e, *nodes in lines}
+            solid.parts[options["ELSET"]] = [*part]
+            solid.elements |= part
+        elif keyword == "SURFACE":
+            corners = ABAQUS_SIDES[4 if solid.kind in ("C3D4", "C3D10") else 8]
+            solid.faces[options["NAME"]] = [
+                [solid.elements[int(e)][int(c) - 1] for c in corners[int(side[1]) - 1][::-1]]
+                for e, side in lines
+            ]
+        elif keyword == "BOUNDARY":
+            solid.fixed += [name for name, *dofs in lines if dofs == ["1", "3"]]
+        elif keyword == "DSLOAD":
+            solid.pressures |= {face: float(value) for face, _, value in lines}
+        elif keyword == "DISTRIBUTION":
+            for element, *values in lines[1:]:
+                axes = [*map(float, values)]
+                solid.a[int(element)], solid.d[int(element)] = axes[:3], axes[3:]
+    for element, length in re.findall(r"^\*\* (\d+),(.*)$", text, re.M):
+        solid.dimensions.setdefault(int(element), []).append(float(length))
     return solid
 
 
@@ -211,7 +224,10 @@ def test_other_programs_get_the_structure_tensor_of_each_element(
             )
             == 0
         )
-        found = reader(path).tensors()
+        solid = reader(path)
+        middles = solid.places().mean(axis=1)[np.array(solid.parts["media"]) - 1]
+        assert len(solid.parts) == 2 and (np.hypot(*middles.T[:2]) < 1.5).all()
+        found = solid.tensors()
         np.testing.assert_allclose(found, recorded_tensors(recording, time), rtol=0, atol=1e-6)
     assert np.abs(recorded_tensors(recording, 0.0) - recorded_tensors(recording, 2.0)).max() > 0.01
     np.testing.assert_allclose(
@@ -223,7 +239,7 @@ def test_other_programs_get_the_structure_tensor_of_each_element(
 def test_elements_are_those_of_the_mesh_and_have_their_nodes_in_order(
     kind: str, reader: Any, start: Path
 ) -> None:
-    """Corners turn around so that the volume is positive; nodes of edges lie between the corners that manuals name."""
+    """Nodes of edges lie between the corners that manuals name."""
     recording, solid = Recording(start), reader(exported(start, kind))
     places, corners = solid.places(), 8 if solid.kind in ("hex8", "hex20", "C3D8", "C3D20") else 4
     assert int("".join(filter(str.isdigit, solid.kind[3:]))) == places.shape[1]
@@ -232,15 +248,41 @@ def test_elements_are_those_of_the_mesh_and_have_their_nodes_in_order(
         places.mean(axis=1).round(9),
         recording.points[recording.elements[:, : places.shape[1]]].mean(axis=1).round(9),
     )
-    last = places[:, 4 if corners == 8 else 3]
-    sides = [places[:, 1], places[:, 3 if corners == 8 else 2], last]
-    assert (np.linalg.det(np.stack([side - places[:, 0] for side in sides], axis=1)) > 0).all()
     for node, (i, j) in enumerate(BETWEEN.get(places.shape[1], []), start=corners):
         ends = places[:, i - 1], places[:, j - 1]
         chord = np.linalg.norm(ends[1] - ends[0], axis=1)
         assert (
             np.linalg.norm(places[:, node] - (ends[0] + ends[1]) / 2, axis=1) < 0.25 * chord
         ).all(), (node, i, j)
+
+
+@pytest.mark.parametrize(("kind", "reader"), [("febio", read_febio), ("abaqus", read_abaqus)])
+def test_faces_close_around_the_body(kind: str, reader: Any, start: Path) -> None:
+    """Seen from outside: area vectors sum to zero, and enclose the volume of a ring between two octagons."""
+    solid, total, volume = reader(exported(start, kind)), np.zeros(3), 0.0
+    assert {*solid.faces} == {"bottom", "top", "inner", "outer"} and solid.pressures == {
+        "inner": 0.0
+    }
+    for facets in solid.faces.values():
+        corners = 3 if solid.kind in ("tet4", "tet10", "C3D4", "C3D10") else 4
+        places = np.array([[solid.nodes[n] for n in facet[:corners]] for facet in facets])
+        vectors = np.cross(places[:, 2] - places[:, 0], places[:, -1] - places[:, 1]) / 2
+        total += vectors.sum(axis=0)
+        volume += np.einsum("ni,ni->", vectors, places.mean(axis=1)) / 3
+    assert np.abs(total).max() < 1e-9 and volume == pytest.approx(8 * np.sqrt(8), rel=1e-9)
+
+
+def test_an_own_vessel_has_parts_fixed_ends_and_pressures(tmp_path: Path) -> None:
+    """At half of the ramps; springs around it are no condition."""
+    mesh = write_tube(tmp_path / "a.msh", "tetrahedron", renamed=NAMES | {"outer": "1 out"})
+    scene = SCENES["vessel"]
+    scene["geometry"]["file"] = str(mesh)
+    vessel = run(Scene(**scene), tmp_path / "run")
+    for kind, reader in (("febio", read_febio), ("abaqus", read_abaqus)):
+        solid = reader(path := exported(vessel, kind))
+        assert len(solid.parts) == 1 and sorted(solid.fixed) == ["inlet", "outlet"]
+        assert solid.pressures == pytest.approx({"inner": 0.3, "outer": 0.1})
+        assert "lengths: mm, stresses: kPa" in path.read_text()
 
 
 def test_what_means_of_elements_leave_out_is_said(

@@ -8,6 +8,11 @@ const GREY = [0.91, 0.92, 0.94], NOTHING_KNOWN = [0.6, 0.62, 0.65];
 const EDGE_LIFT = 0.02;  // of lines between elements towards the eye, over the smallest side of a face
 const WORDS_OVER_THE_BODY = 62;  // pixels at the top and at the bottom that buttons and scale take
 const EXTENSION_COLOURS = ["#fff7d6", "#fbd98a", "#f5a754", "#e0662f", "#a8281e", "#4f0a16"];
+const STRESS_COLOURS = ["#440154", "#414487", "#2a788e", "#22a884", "#7ad151", "#fde725"];
+const STRESSES = {
+  hoop_stress: "hoop stress", axial_stress: "axial stress",
+  max_principal_stress: "largest principal stress", von_mises_stress: "von Mises stress",
+};
 
 const rgb = (hex) => [1, 3, 5].map((at) => parseInt(hex.slice(at, at + 2), 16) / 255);
 const add = (a, b, s = 1) => [a[0] + s * b[0], a[1] + s * b[1], a[2] + s * b[2]];
@@ -228,6 +233,12 @@ class Stage {
   }
 }
 
+// The colour at a share from 0 to 1 of the way through some colours.
+function between(colours, share) {
+  const last = colours.length - 1, place = Math.max(0, Math.min(last, share * last)), k = Math.min(last - 1, Math.floor(place));
+  return add(times(colours[k], 1 - place + k), colours[k + 1], place - k);
+}
+
 // Which elements are shown and how.
 class Body {
   constructor(data, arrays, clock) {
@@ -236,6 +247,7 @@ class Body {
     this.stage = new Stage(document.getElementById("body"), this.elements.box, data);
     this.colours = data.colours.map(rgb);
     this.warm = EXTENSION_COLOURS.map(rgb);
+    this.green = STRESS_COLOURS.map(rgb);
     this.peeled = 0;
     this.cut = "whole";
     const ways = document.getElementById("shown"), isThere = (way) => way.dataset.needs.split(" ").every((name) => name in arrays);
@@ -262,15 +274,15 @@ class Body {
   colourOf(e) {
     const at = this.clock.index * this.elements.count + e;
     if (this.mode === "extension") return this.warmth(this.arrays.extension[at] / 255);
+    if (this.mode in STRESSES) return between(this.green, this.arrays[this.mode][at] / 255);
     if (!this.arrays.angle || this.mode === "shape") return GREY;
     const step = this.arrays.angle[at];
     return step === NO_ANGLE ? NOTHING_KNOWN : this.colours[Math.floor((step * this.colours.length) / ANGLE_STEPS)];
   }
 
   warmth(extension) {
-    const least = this.data.least_extension, last = this.warm.length - 1;
-    const place = Math.max(0, Math.min(last, ((extension - least) / (1 - least)) * last)), k = Math.min(last - 1, Math.floor(place));
-    return add(times(this.warm[k], 1 - place + k), this.warm[k + 1], place - k);
+    const least = this.data.least_extension;
+    return between(this.warm, (extension - least) / (1 - least));
   }
 
   show() {
@@ -327,18 +339,21 @@ class Body {
 
   // The colours and what they mean.
   scale() {
-    if (this.mode === "shape" || (this.mode !== "extension" && !this.arrays.angle)) return [];
-    const isExtension = this.mode === "extension", bar = element("div", { class: "bar" });
+    const isExtension = this.mode === "extension", isStress = this.mode in STRESSES, bar = element("div", { class: "bar" });
+    if (this.mode === "shape" || (!isExtension && !isStress && !this.arrays.angle)) return [];
     const least = this.data.least_extension, count = this.data.colours.length;
     this.colours.forEach((colour, k) => {
-      const shown = isExtension ? this.warmth(least + ((1 - least) * (k + 0.5)) / count) : colour, part = element("i");
+      const share = (k + 0.5) / count, part = element("i");
+      const shown = isExtension ? this.warmth(least + (1 - least) * share) : isStress ? between(this.green, share) : colour;
       part.style.background = `rgb(${shown.map((share) => Math.round(255 * share))})`;
       bar.append(part);
     });
-    const [first, last] = isExtension ? [inDigits(this.data.least_extension), "1"]
+    const [first, last] = isStress ? this.data[this.mode].map(inDigits)
+      : isExtension ? [inDigits(this.data.least_extension), "1"]
       : [`0° ${this.data.words[0]}`, `90° ${this.data.words[1]}`];
     const ends = element("div", { class: "ends" }, element("span", {}, first), element("span", {}, last));
-    return [isExtension ? "largest r/L" : "collagen, deformed", bar, ends];
+    const words = isStress ? `${STRESSES[this.mode]} ${this.data.unit}` : isExtension ? "largest r/L" : "collagen, deformed";
+    return [words, bar, ends];
   }
 }
 

@@ -1,7 +1,8 @@
-// Cauchy's stress, with what the law of Laplace gives, and content, through the wall at the time that the page shows.
+// Cauchy's stress, with what the law of Laplace gives, also by sector, and content, through the wall at the time that the page shows.
 const LINES = ["--first", "--second", "--third"];
+const lineColour = (k, count) => (count > LINES.length ? `hsl(${Math.round((260 * (count - 1 - k)) / (count - 1))} 65% 45%)` : `var(${LINES[k]})`);
 
-for (const name of ["stress", "content"]) {
+for (const name of ["stress", "sectors", "content"]) {
   PARTS[name] = (data, arrays, clock) => {
     const place = document.getElementById(name);
     clock.onChange(() => place.replaceChildren(wallDrawing(data, clock, name)));
@@ -35,16 +36,18 @@ function wallDrawing(data, clock, what) {
   }
   const ends = [];
   data.names.forEach((name, k) => {
-    const colour = LINES[k];
+    const colour = lineColour(k, data.names.length);
     const points = rows.map((row, layer) => [x(data.depth[layer]), y(row[k])]);
     const path = points.map(([a, b], i) => `${i ? "L" : "M"}${a.toFixed(1)} ${b.toFixed(1)}`).join("");
-    drawing.append(element("path", { d: path, fill: "none", stroke: `var(${colour})`, "stroke-width": 2.2 }));
-    for (const [cx, cy] of points) drawing.append(element("circle", { cx, cy, r: 2.5, fill: `var(${colour})` }));
-    ends.push({ name, y: points.at(-1)[1] });
+    drawing.append(element("path", { d: path, fill: "none", stroke: colour, "stroke-width": 2.2 }));
+    for (const [cx, cy] of points) drawing.append(element("circle", { cx, cy, r: 2.5, fill: colour }));
+    ends.push({ name, colour, y: points.at(-1)[1] });
   });
   ends.sort((a, b) => a.y - b.y);
   apart(ends.map((end) => end.y)).forEach((place, k) => {
-    drawing.append(element("text", { x: 274, y: place + 4 }, ends[k].name));
+    const label = element("text", { x: 274, y: place + 4 }, ends[k].name);
+    label.style.fill = ends[k].colour;
+    drawing.append(label);
   });
   drawing.append(element("text", { x: 158, y: 188, "text-anchor": "middle" }, data.through));
   return drawing;
