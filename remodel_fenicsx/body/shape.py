@@ -1025,19 +1025,28 @@ def cauchy_columns(*names: str) -> Columns:
     ['cauchy_stress_x', 'cauchy_stress_xy']
     """
 
-    def mean(name: str, m: Any) -> float:
-        row, column = "xyz".index(name[0]), "xyz".index(name[-1])
-        return m.quadrature.mean(m.stress[..., row, column])
+    return tensor_columns("cauchy_stress", "stress", "Cauchy stress", attrgetter("stress"), names)
 
+
+def tensor_columns(
+    quantity: str, unit: str, words: str, tensor: Callable[[Any], Array], names: Iterable[str]
+) -> Columns:
+    """Return columns of a tensor, volume means, for letters of one or two axes each."""
     return tuple(
-        Column(
-            f"cauchy_stress_{name}",
-            "stress",
-            f"Cauchy stress {name}, volume mean",
-            partial(mean, name),
-        )
+        Column(f"{quantity}_{name}", unit, f"{words} {name}, volume mean", component(tensor, name))
         for name in names
     )
+
+
+def component(tensor: Callable[[Any], Array], name: str) -> Callable[[Any], float]:
+    """Return the volume mean of a component, of one or two letters, of a tensor at the points."""
+    row, column = "xyz".index(name[0]), "xyz".index(name[-1])
+
+    def mean(m: Any) -> float:
+        values = m.cached_for_step(tensor, lambda: tensor(m))
+        return float(m.quadrature.mean(values[..., row, column]))
+
+    return mean
 
 
 def homogeneous_bar(
