@@ -26,7 +26,7 @@ TRUTH = {
 }
 PROTOCOLS = {"1:1": (0.25, 0.25), "2:1": (0.3, 0.15), "1:2": (0.15, 0.3)}  # strains along x and y
 LEVELS, CYCLES = np.arange(1, 9) / 8, 5
-STIFFER, HYSTERESIS, NOISE = 0.3, 0.1, 0.01  # of the first cycle, of unloading, in N
+STIFFER, HYSTERESIS, NOISE = 0.3, 0.1, 0.001  # of the first cycle, of unloading, in N
 
 
 def forces(scene: Scene, strains: tuple[float, float]) -> np.ndarray:
@@ -61,7 +61,7 @@ def main() -> None:
             for level, force in zip(levels, both + random.normal(0.0, NOISE, both.shape)):
                 time += 1
                 moved = 20.0 * level * np.array(strains)
-                numbers = ",".join(f"{number:.3f}" for number in (*moved, *force))
+                numbers = ",".join(f"{number:.4f}" for number in (*moved, *force))
                 lines.append(f"{time},{name},{cycle},{numbers}")
     Path(options.o).write_text("\n".join(lines) + "\n", encoding="utf-8")
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from abc import abstractmethod
 from collections.abc import Sequence
+from operator import attrgetter
 from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal
 
 import numpy as np
@@ -18,7 +19,7 @@ from remodel_fenicsx.body.shape import (
     axial_dead_force,
     cauchy_columns,
     check_lengths,
-    component,
+    mean_component,
     homogeneous_bar,
     tensor_columns,
     uniaxial_columns,
@@ -34,10 +35,6 @@ if TYPE_CHECKING:
 
     from remodel_fenicsx.body.domain import Domain
     from remodel_fenicsx.body.loading import Loading
-
-
-def _deformation_gradient(m: Any) -> Array:
-    return np.asarray(m.F)
 
 
 def _nominal_stress(m: Any) -> Array:
@@ -154,7 +151,7 @@ SIDES = "xy"
 
 def _force(side: int) -> LoadKind:
     axis, other = SIDES[side], SIDES[1 - side]
-    nominal = component(_nominal_stress, axis)
+    nominal = mean_component(_nominal_stress, axis)
 
     def area(shape: Any) -> float:
         return float(getattr(shape, f"length_{other}") * shape.thickness)
@@ -173,7 +170,7 @@ def _force(side: int) -> LoadKind:
 
 
 def _elongation(side: int) -> LoadKind:
-    axis, stretch = SIDES[side], component(_deformation_gradient, SIDES[side])
+    axis, stretch = SIDES[side], mean_component(attrgetter("F"), SIDES[side])
     return LoadKind(
         lambda shape, loading, name: loading.add_prescribed_elongation(
             name, f"{axis}1", side, getattr(shape, f"length_{axis}")
@@ -233,7 +230,7 @@ class Sheet(Box):
             "thickness_stretch",
             "",
             "stretch F_zz through the sheet, volume mean",
-            component(_deformation_gradient, "z"),
+            mean_component(attrgetter("F"), "z"),
         ),
         *cauchy_columns("x", "y", "xy"),
         *tensor_columns(

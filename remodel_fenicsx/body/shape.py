@@ -12,7 +12,7 @@ from dataclasses import dataclass, replace
 from functools import partial
 from operator import attrgetter, methodcaller
 from pathlib import Path
-from typing import Any, ClassVar, Literal, NamedTuple, TYPE_CHECKING
+from typing import Any, ClassVar, Literal, NamedTuple, TYPE_CHECKING, TypeVar
 
 import numpy as np
 
@@ -45,6 +45,8 @@ if TYPE_CHECKING:
 Regions = Mapping[str, Region]
 Supports = Mapping[str, Support]
 Loads = Mapping[str, Load]
+T = TypeVar("T")
+Measure = Callable[[Any], T]  # of a `results.columns.Measurement`
 
 
 # ---------------------------------------------------------------- the columns of a history
@@ -1029,16 +1031,18 @@ def cauchy_columns(*names: str) -> Columns:
 
 
 def tensor_columns(
-    quantity: str, unit: str, words: str, tensor: Callable[[Any], Array], names: Iterable[str]
+    quantity: str, unit: str, words: str, tensor: Measure[Array], names: Iterable[str]
 ) -> Columns:
     """Return columns of a tensor, volume means, for letters of one or two axes each."""
     return tuple(
-        Column(f"{quantity}_{name}", unit, f"{words} {name}, volume mean", component(tensor, name))
+        Column(
+            f"{quantity}_{name}", unit, f"{words} {name}, volume mean", mean_component(tensor, name)
+        )
         for name in names
     )
 
 
-def component(tensor: Callable[[Any], Array], name: str) -> Callable[[Any], float]:
+def mean_component(tensor: Measure[Array], name: str) -> Measure[float]:
     """Return the volume mean of a component, of one or two letters, of a tensor at the points."""
     row, column = "xyz".index(name[0]), "xyz".index(name[-1])
 

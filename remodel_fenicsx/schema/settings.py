@@ -506,7 +506,7 @@ class Cells(Table):
     file."""
     fraction_x: float | None = Field(default=None, ge=0, le=1)
     """Fraction of the chains along the first axis, (l_1 / r0)^2: x, or circumferential in a wall.
-    With fraction_y it takes the place of `initial`; the remainder lies along the third axis."""
+    With fraction_y it replaces `initial`; the remainder lies along the third axis."""
     fraction_y: float | None = Field(default=None, ge=0, le=1)
     """Fraction of the chains along the second axis: y, or axial in a wall."""
     mean_angle: float = Field(default=0.0, ge=-360, le=360)

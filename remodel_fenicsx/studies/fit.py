@@ -24,6 +24,7 @@ from pydantic import Field, model_validator
 
 from remodel_fenicsx._version import __version__
 from remodel_fenicsx.body.reductions import describe_choice
+from remodel_fenicsx.model.cells import turned_about_z
 from remodel_fenicsx.errors import BAD_ENVIRONMENT, SOLVE_FAILED, RemodelError, UnreadableFile
 from remodel_fenicsx.results.run_folder import chosen_folder
 from remodel_fenicsx.results.recording import RunLock
@@ -250,11 +251,11 @@ def _bounded(key: str, unknown: Unknown, scene: Scene, starts: Mapping[str, floa
 
     def allowed(logarithm: float) -> bool:
         # The start times a factor is allowed alone, or if all unknowns have the same factor, with
-        # which a wall keeps its shape, or if the others are small, as fractions with a sum.
+        # which a wall keeps its shape, or if another one is small, as of fractions with a sum.
         number = float(np.exp(logarithm))
         moved = {other: start * number / unknown.start for other, start in starts.items()}
-        small = {other: start / WIDE for other, start in starts.items()}
-        for values in (starts, moved, small):
+        small = [{**starts, other: start / WIDE} for other, start in starts.items()]
+        for values in (starts, moved, *small):
             with suppress(SceneError):
                 return bool(scene.with_values({**values, key: number}))
         return False
@@ -287,7 +288,7 @@ def _measured(table: MeasuredTable, place: str, folder: Path, scene: Scene) -> I
         )
     file = f"{place}.file = {format_value(table.file)}"
     columns, units = _read_columns(table, folder, place, scene)
-    number = columns.pop(PROTOCOL, None)
+    labels = columns.pop(PROTOCOL, None)
     loads = _prescribed(columns, table, scene, place)
     _check_columns(columns, loads, table.state, file, scene)
     for key in ("sd", "scale"):
@@ -305,7 +306,7 @@ def _measured(table: MeasuredTable, place: str, folder: Path, scene: Scene) -> I
                 else "missing: each measured column needs a standard deviation"
             )
             raise SceneError(f"{place}.sd.{name}: {rule}")
-    rows, numbers = _rows(columns, loads, number, table)
+    rows, numbers = _rows(columns, loads, labels, table)
     if others := {*table.protocols} - {*numbers}:
         known = ", ".join(map(str, np.unique(numbers)))
         raise SceneError(f"{place}.protocols = {min(others)}: no such protocol; there are {known}")
@@ -327,13 +328,14 @@ def _measured(table: MeasuredTable, place: str, folder: Path, scene: Scene) -> I
 
 
 def _rows(
-    columns: Columns, loads: tuple[str, ...], number: Array | None, table: MeasuredTable
+    columns: Columns, loads: tuple[str, ...], labels: Array | None, table: MeasuredTable
 ) -> tuple[Integers, Integers]:
     """Return the chosen rows, and the numbers of the protocols of all rows; log hysteresis."""
     sizes = [np.abs(columns[name]) / (np.abs(columns[name]).max() or 1.0) for name in loads]
     size = np.max([np.zeros(len(next(iter(columns.values())))), *sizes], axis=0)
-    if number is None:  # loads decrease by over half between two protocols
-        number = 1 + np.cumsum(np.diff(size, prepend=0.0) < -0.5)
+    # Without labels loads decrease by over half between two protocols.
+    jumps = 1 + np.cumsum(np.diff(size, prepend=0.0) < -0.5)
+    number: Integers = (jumps if labels is None else labels).astype(np.int64)
     chosen, gaps = list[Integers](), dict.fromkeys(table.sd, 0.0)
     for one in np.unique(number):
         rows = np.flatnonzero(number == one)
@@ -350,7 +352,7 @@ def _rows(
             words = "loading and unloading differ by %.2g standard deviations on the mean"
             remedy = "the model has no hysteresis; rows = 'last loading' takes loading alone"
             log.warning(f"%s, %s: {words}; {remedy}", table.file, name, gap)
-    return np.concatenate(chosen), number.astype(np.int64)
+    return np.concatenate(chosen), number
 
 
 def _cycles(size: Array) -> list[Integers]:
@@ -513,6 +515,7 @@ def data_warnings(
 TISSUE = r"(regions\.\w+\.)?(material\.[\w.]+|remodeling\.(kappa|half_life))"
 OTHERS = r"loads\.\w+\.value|natural\.\w+"
 CAN_BE_SET = rf"scale\..*|{TISSUE}|{OTHERS}"
+OF_CELLS = r"cells\.(fraction_[xy]|mean_angle)"  # for runs whose cells are set
 # With these tolerances only rounding errors are amplified by difference quotients of runs.
 PRECISE = {"solver.relative_tolerance": 1e-13, "solver.absolute_tolerance": 0.0}
 
@@ -528,9 +531,11 @@ def model_of(
         end = max(float(step * np.ceil(measured.max() / step - 1e-9)), step)
         columns, _ = _run(scene.with_values({"time.end": end}), table, kept)
         return {name: np.interp(measured, columns["time"], columns[name]) for name in table.sd}
-    start = None
+    start, cells = None, scene.cells
     if table.state == "after":
         _, start = _run(scene.with_values({"time.end": table.time}), table, kept)
+    elif cells.axes == "global" and not (scene.regions or isinstance(cells.initial, str)):
+        start = cells.dimensions(1), turned_about_z(np.eye(3), cells.mean_angle)
     columns, _ = _run(_passive(scene, table, scales), table, kept, start)
     return {name: columns[name][columns["time"] > 0] for name in table.sd}
 
@@ -573,8 +578,9 @@ class SimulationCache(dict[object, tuple[Simulation, Snapshot]]):
         """Return a simulation of the scene at t = 0, a cached one if possible."""
         use = id(table), has_own_cells, scene.model.kinematics, scene.mesh.formulation
         if use in self:
+            can_be_set = CAN_BE_SET if has_own_cells else rf"{CAN_BE_SET}|{OF_CELLS}"
             if all(
-                re.fullmatch(CAN_BE_SET, key) for key in self.keys_of_scene
+                re.fullmatch(can_be_set, key) for key in self.keys_of_scene
             ) and reset_simulation(*self[use], scene):
                 return self[use][0]
             self.pop(use)[0].close()

@@ -217,7 +217,7 @@ def label_of_key(scene: Scene, key: str) -> str:
     return label(scene, " ".join([*parents[1:2], name]), unit_of(scene, unit))
 
 
-def value_at(scene: Scene, parts: Iterable[str]) -> Any:
+def value_at(scene: Scene, parts: Iterable[str]) -> object:
     """Return the value of a scene at the parts of a dotted key."""
     there: Any = scene
     for part in parts:
