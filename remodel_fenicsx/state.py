@@ -23,7 +23,7 @@ from remodel_fenicsx.fem.kinematics import Kinematics
 from remodel_fenicsx.fem.quadrature import Quadrature
 from remodel_fenicsx.kernels import PointKernels, point_kernels, with_kernels
 from remodel_fenicsx.model.axes import AXES, LocalAxes, cells_from_tensors, structure_tensors
-from remodel_fenicsx.model.cells import UnitCell
+from remodel_fenicsx.model.cells import UnitCell, turned_about_z
 from remodel_fenicsx.model.energy import (
     AXES_ON_THE_RADIUS,
     ELASTIN,
@@ -188,7 +188,8 @@ class UnitCells(CellField):
 
     def initial_axes(self) -> Array:
         """Return the initial axes n_I as rows, (elements, points, 3, 3)."""
-        return AXES[self.settings.axes](self.local_axes)
+        axes = AXES[self.settings.axes](self.local_axes)
+        return turned_about_z(axes, self.settings.mean_angle)
 
 
 # ---------------------------------------------------------------- the state

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 from abc import abstractmethod
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
+from operator import attrgetter
 from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal
 
 import numpy as np
@@ -12,12 +13,15 @@ from pydantic import Field, model_validator
 from remodel_fenicsx.body import gmsh_model as model
 from remodel_fenicsx.body.shape import (
     Column,
+    Columns,
     LoadKind,
     WithAxes,
     axial_dead_force,
     cauchy_columns,
     check_lengths,
+    mean_component,
     homogeneous_bar,
+    tensor_columns,
     uniaxial_columns,
 )
 from remodel_fenicsx.body.reductions import box
@@ -31,6 +35,28 @@ if TYPE_CHECKING:
 
     from remodel_fenicsx.body.domain import Domain
     from remodel_fenicsx.body.loading import Loading
+
+
+def _nominal_stress(m: Any) -> Array:
+    """Return P = J sigma F^-T."""
+    inverse = np.linalg.inv(m.F)
+    return np.einsum("...,...ij,...kj->...ik", np.linalg.det(m.F), m.stress, inverse)
+
+
+def material_columns(*names: str) -> Columns:
+    """Return columns of Green strain and second Piola-Kirchhoff stress, of one or two axes each."""
+
+    def strain(m: Any) -> Array:
+        return np.asarray(np.swapaxes(m.F, -1, -2) @ m.F - np.eye(3)) / 2
+
+    def stress(m: Any) -> Array:
+        return np.linalg.solve(m.F, _nominal_stress(m))
+
+    words = "second Piola-Kirchhoff stress S = F^-1 P"
+    return (
+        *tensor_columns("green_strain", "", "Green strain E = (F^T F - 1) / 2", strain, names),
+        *tensor_columns("second_piola_kirchhoff_stress", "stress", words, stress, names),
+    )
 
 
 class Box(WithAxes):
@@ -105,7 +131,7 @@ class Cube(Box):
 
     loads = {"force": axial_dead_force("z1")}
     columns = uniaxial_columns("z1", "side")
-    columns_on_request = cauchy_columns("x", "y", "z")
+    columns_on_request = cauchy_columns("x", "y", "z") + material_columns("x", "y", "z")
     number_of_elements = 1
     _counts: ClassVar[tuple[int, int, int]] = (1, 1, 1)
 
@@ -123,33 +149,9 @@ class Cube(Box):
 SIDES = "xy"
 
 
-def _gradient(row: int, column: int) -> Callable[[Any], float]:
-    """Return a measure: the volume mean of a component of F; a diagonal one is a length ratio."""
-    return lambda m: m.quadrature.mean(m.F[..., row, column])
-
-
-def _nominal(row: int, column: int) -> Callable[[Any], float]:
-    """Return a measure: the volume mean of a component of P = J sigma F^-T."""
-
-    def value(m: Any) -> float:
-        def mean() -> Array:
-            stress = (
-                np.linalg.det(m.F)[..., None, None]
-                * m.stress
-                @ np.swapaxes(np.linalg.inv(m.F), -1, -2)
-            )
-            return np.array(
-                [[m.quadrature.mean(stress[..., i, j]) for j in range(3)] for i in range(3)]
-            )
-
-        return float(m.cached_for_step("nominal stress", mean)[row, column])
-
-    return value
-
-
 def _force(side: int) -> LoadKind:
     axis, other = SIDES[side], SIDES[1 - side]
-    nominal = _nominal(side, side)
+    nominal = mean_component(_nominal_stress, axis)
 
     def area(shape: Any) -> float:
         return float(getattr(shape, f"length_{other}") * shape.thickness)
@@ -168,7 +170,7 @@ def _force(side: int) -> LoadKind:
 
 
 def _elongation(side: int) -> LoadKind:
-    axis, stretch = SIDES[side], _gradient(side, side)
+    axis, stretch = SIDES[side], mean_component(attrgetter("F"), SIDES[side])
     return LoadKind(
         lambda shape, loading, name: loading.add_prescribed_elongation(
             name, f"{axis}1", side, getattr(shape, f"length_{axis}")
@@ -225,20 +227,21 @@ class Sheet(Box):
             by_case=False,
         ),
         Column(
-            "thickness_stretch", "", "stretch F_zz through the sheet, volume mean", _gradient(2, 2)
+            "thickness_stretch",
+            "",
+            "stretch F_zz through the sheet, volume mean",
+            mean_component(attrgetter("F"), "z"),
         ),
         *cauchy_columns("x", "y", "xy"),
-        *(
-            Column(
-                f"nominal_stress_{words}",
-                "stress",
-                f"first Piola-Kirchhoff stress P_{words * (3 - len(words))}, volume mean: "
-                f"along {words[0]} on edges across {words[-1]}",
-                _nominal(*place),
-            )
-            for words, place in (("x", (0, 0)), ("y", (1, 1)), ("xy", (0, 1)), ("yx", (1, 0)))
+        *tensor_columns(
+            "nominal_stress",
+            "stress",
+            "first Piola-Kirchhoff stress, along the first axis on edges across the last,",
+            _nominal_stress,
+            ("x", "y", "xy", "yx"),
         ),
     )
+    columns_on_request = material_columns("x", "y", "xy")
     number_of_elements = 16
     _counts: ClassVar[tuple[int, int, int]] = (4, 4, 1)
     depth_labels = ("through the sheet", "lower face", "upper face")

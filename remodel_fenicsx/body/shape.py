@@ -13,7 +13,7 @@ from dataclasses import dataclass, replace
 from functools import partial
 from operator import attrgetter
 from pathlib import Path
-from typing import Any, ClassVar, Literal, NamedTuple, TYPE_CHECKING
+from typing import Any, ClassVar, Literal, NamedTuple, TYPE_CHECKING, TypeVar
 
 import numpy as np
 
@@ -48,6 +48,8 @@ log = logging.getLogger(__name__)
 Regions = Mapping[str, Region]
 Supports = Mapping[str, Support]
 Loads = Mapping[str, Load]
+T = TypeVar("T")
+Measure = Callable[[Any], T]  # of a `results.columns.Measurement`
 
 
 # ---------------------------------------------------------------- the columns of a history
@@ -1028,19 +1030,30 @@ def cauchy_columns(*names: str) -> Columns:
     ['cauchy_stress_x', 'cauchy_stress_xy']
     """
 
-    def mean(name: str, m: Any) -> float:
-        row, column = "xyz".index(name[0]), "xyz".index(name[-1])
-        return m.quadrature.mean(m.stress[..., row, column])
+    return tensor_columns("cauchy_stress", "stress", "Cauchy stress", attrgetter("stress"), names)
 
+
+def tensor_columns(
+    quantity: str, unit: str, words: str, tensor: Measure[Array], names: Iterable[str]
+) -> Columns:
+    """Return columns of a tensor, volume means, for letters of one or two axes each."""
     return tuple(
         Column(
-            f"cauchy_stress_{name}",
-            "stress",
-            f"Cauchy stress {name}, volume mean",
-            partial(mean, name),
+            f"{quantity}_{name}", unit, f"{words} {name}, volume mean", mean_component(tensor, name)
         )
         for name in names
     )
+
+
+def mean_component(tensor: Measure[Array], name: str) -> Measure[float]:
+    """Return the volume mean of a component, of one or two letters, of a tensor at the points."""
+    row, column = "xyz".index(name[0]), "xyz".index(name[-1])
+
+    def mean(m: Any) -> float:
+        values = m.cached_for_step(tensor, lambda: tensor(m))
+        return float(m.quadrature.mean(values[..., row, column]))
+
+    return mean
 
 
 def homogeneous_bar(

@@ -78,6 +78,13 @@ def global_axes(coordinates: Array) -> Array:
     return axes
 
 
+def turned_about_z(axes: Array, angle: float) -> Array:
+    """Return axes as rows (..., 3, 3), turned about z from x towards y by an angle in degrees."""
+    x = np.exp(1j * np.radians(angle))
+    turned: Array = axes @ [[x.real, x.imag, 0.0], [-x.imag, x.real, 0.0], [0.0, 0.0, 1.0]]
+    return turned
+
+
 def cylindrical_axes(coordinates: Array) -> Array:
     """Return circumferential, axial and radial direction about z as rows, (..., 3, 3)."""
     axes = np.zeros((*coordinates.shape[:-1], 3, 3))

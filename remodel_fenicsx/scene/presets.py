@@ -135,7 +135,12 @@ class MeasuredParameter(NamedTuple):
     table: str
     key: str
     replaces: str
-    own: Callable[[Properties, float], float]
+    own: Callable[[Properties, float], object]
+
+
+def _lengths(one: Properties, fraction_x: float) -> tuple[float, ...]:
+    y, r0 = one.cells.fraction_y or 0.0, one.cells.end_to_end_length
+    return tuple(r0 * math.sqrt(max(0.0, part)) for part in (fraction_x, y, 1 - fraction_x - y))
 
 
 EXPERIMENTS = (  # The order matters: the density needs the contour length.
@@ -147,6 +152,8 @@ EXPERIMENTS = (  # The order matters: the density needs the contour length.
     ),
     MeasuredParameter("material", "initial_stiffness", "chain_density", _chain_density),
     MeasuredParameter("remodeling", "half_life", "kappa", lambda one, value: math.log(2) / value),
+    MeasuredParameter("cells", "fraction_x", "initial", _lengths),
+    MeasuredParameter("cells", "fraction_y", "initial", lambda one, _: one.cells.initial),
 )
 
 
@@ -181,7 +188,7 @@ def with_own_numbers(part: S, properties: Callable[[S], Properties]) -> S:
     """Replace the experimental parameters of a scene or region by the model's own."""
     for table, key, replaces, own in EXPERIMENTS:
         keys = getattr(part, table)
-        if (value := getattr(keys, key)) is not None:
+        if (value := getattr(keys, key, None)) is not None:
             numbers = {key: None, replaces: own(properties(part), value)}
             part = part.model_copy(update={table: keys.model_copy(update=numbers)})
     return part

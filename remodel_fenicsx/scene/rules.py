@@ -10,6 +10,7 @@ import re
 from collections import Counter
 
 from remodel_fenicsx.body import SHAPES
+from remodel_fenicsx.body.box import Sheet
 from remodel_fenicsx.body.reductions import AUTO, choice, objections, too_many_elements
 from remodel_fenicsx.body.shape import FromFile, Unloads, WithAxes, WithRegions
 from remodel_fenicsx.body.wall import RoundWall, Walled
@@ -119,8 +120,10 @@ def loaded_body(scene: Scene) -> Faults:
 
 
 def same_strain(scene: Scene) -> Faults:
-    """Check that loads that need a uniform strain have homogeneous kinematics."""
-    made = choice(scene)
+    """Check that loads and cells that need a uniform strain have homogeneous kinematics."""
+    made, angle = choice(scene), scene.cells.mean_angle
+    if angle and not (isinstance(scene.geometry, Sheet) and KINEMATICS[made.name].homogeneous):
+        yield "needs a sheet with model.kinematics = 'point'", "cells.mean_angle", angle
     for name, load in scene.loads.items():
         if scene.load_kinds[name].of_one_strain and not KINEMATICS[made.name].homogeneous:
             reasons = "; ".join(made.objections["point"]) or f"model.kinematics = {made.name!r}"

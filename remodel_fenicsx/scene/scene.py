@@ -373,6 +373,7 @@ class Scene(Table):
         }
         self.__dict__ |= {
             "material": whole.material,
+            "cells": whole.cells,
             "remodeling": whole.remodeling,
             "regions": regions,
         }

@@ -507,6 +507,14 @@ class Cells(Table):
     )
     """SHA-256 of the file cells.fibres. The scene that a run stores has it, and rejects another
     file."""
+    fraction_x: float | None = Field(default=None, ge=0, le=1)
+    """Fraction of the chains along the first axis, (l_1 / r0)^2: x, or circumferential in a wall.
+    With fraction_y it replaces `initial`; the remainder lies along the third axis."""
+    fraction_y: float | None = Field(default=None, ge=0, le=1)
+    """Fraction of the chains along the second axis: y, or axial in a wall."""
+    mean_angle: float = Field(default=0.0, ge=-360, le=360)
+    """Angle from x to the first axis of the cells of a sheet at t = 0, towards y, in degrees. The
+    strain of the sheet is then uniform."""
     axes: Annotated[str, OneOf(AXES)] = "global"
     """Cell axes n_I before the first pass. 'global': x, y, z. 'cylindrical': circumferential,
     axial, radial, about the z axis. 'local': the same, computed on a mesh (docs/my_own_vessel.md).
@@ -526,6 +534,9 @@ class Cells(Table):
     def _faults(self) -> Faults:
         if (rule := self.length_problem()) is not None:
             yield rule, "initial", self.initial
+        x, y = self.fraction_x, self.fraction_y
+        if (x, y) != (None, None) and (x is None or y is None or x + y > 1):
+            yield "goes with fraction_x, and both have a sum of at most 1", "fraction_y", y
 
     def length_problem(self) -> str | None:
         """Return why `initial` contradicts `end_to_end_length`, or None if it does not."""

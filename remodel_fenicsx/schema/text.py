@@ -13,7 +13,7 @@ import math
 import re
 import textwrap
 import tomllib
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -190,13 +190,43 @@ def read_columns(
     allowed: Iterable[str],
     spellings: Mapping[str, str] | None = None,
     unused: Iterable[str] = (),
+    headers: Mapping[str, str] | None = None,
+    chosen: Mapping[str, Sequence[object]] | None = None,
+    labels: str = "",
 ) -> dict[str, NDArray[np.float64]]:
-    """Read columns of numbers by name, (rows,), and log how they were written."""
-    names, rows, written = _cells(data)
+    """Read columns of numbers by name, (rows,), and log how they were written.
+
+    Parameters
+    ----------
+    data, file
+        Content and name of the file.
+    allowed, unused
+        Names of the columns that the caller reads, and of those that it leaves out.
+    spellings
+        Names by other names of columns, in lower case.
+    headers
+        Headers of the file by name. Only these columns are read, and lines before the header and a
+        row of units are left out.
+    chosen
+        Values by header, of the rows to read.
+    labels
+        Name of a column of labels, which are numbered from 1 in their order.
+    """
+    headers, chosen = headers or {}, chosen or {}
+    names, rows, written = _cells(data, headers.values())
+    if missing := [name for name in (*headers.values(), *chosen) if name not in names]:
+        raise UnreadableFile(
+            f"has no column {format_value(missing[0])}; it has {listed(names, missing[0])}"
+        )
     allowed, unused = list(allowed), set(unused)
     known = {name.lower(): name for name in (*allowed, *unused)}
     head = [known.get((spellings or {}).get(name.lower(), name.lower()), "") for name in names]
-    if unknown := [name for name, meant in zip(names, head, strict=True) if not meant]:
+    if headers:
+        named = {header: name for name, header in headers.items()}
+        head = [named.get(name, "") for name in names]
+    elif unknown := [
+        name for name, meant in zip(names, head, strict=True) if not meant and name not in chosen
+    ]:
         if all(_number(name, ".") is not None for name in names):
             raise UnreadableFile(
                 "begins with a row of numbers; the first row must have the names of the columns"
@@ -204,32 +234,49 @@ def read_columns(
         raise UnreadableFile(
             f"unknown column {format_value(unknown[0])}; allowed: {listed(allowed, unknown[0])}"
         )
-    if twice := [name for number, name in enumerate(head) if name in head[:number]]:
+    if twice := [name for number, name in enumerate(head) if name and name in head[:number]]:
         raise UnreadableFile(f"duplicate column {twice[0]}")
-    mark = "," if any("," in cell for row in rows for cell in row) else "."
-    values = np.empty((len(rows), len(head)))
     for number, row in enumerate(rows):
         if len(row) != len(head):
             raise UnreadableFile(f"row {number + 1} has {len(row)} numbers, not {len(head)}")
-        for place, cell in enumerate(row):
-            if (value := _number(cell, mark)) is None:
-                more = " (others have decimal commas)" if mark == "," and "." in cell else ""
-                raise UnreadableFile(
-                    f"row {number + 1}, {head[place]}: {format_value(cell)} is not a number{more}"
-                )
-            values[number, place] = value
-    used = {name: column for name, column in zip(head, values.T, strict=True) if name not in unused}
+    used = [place for place, name in enumerate(head) if name and name not in unused]
+    table = np.array(rows)
+    mark = "," if any("," in cell for cell in table[:, used].flat) else "."
+    if headers and all(_number(cell, mark) is None for cell in table[0, used]):
+        table = table[1:]
+    for header, values in chosen.items():
+        cells = table[:, names.index(header)]
+        table = table[[cell in values or _number(cell, mark) in values for cell in cells]]
+    if not len(table):
+        raise UnreadableFile(f"has no row of numbers with {chosen}")
+    columns = {
+        head[place]: _numbers([*table[:, place]], head[place], mark, head[place] == labels)
+        for place in used
+    }
     words = [f"{written} between columns", *(["decimal commas"] if mark == "," else [])]
-    words += (
-        [f"not used: {', '.join(left)}"]
-        if (left := [name for name in head if name in unused])
-        else []
-    )
-    log.info("%s: %d rows of %s; %s", file, len(rows), ", ".join(used), "; ".join(words))
-    return used
+    left = [name for name, meant in zip(names, head, strict=True) if meant not in columns]
+    words += [f"not used: {', '.join(left)}"] if left else []
+    log.info("%s: %d rows of %s; %s", file, len(table), ", ".join(columns), "; ".join(words))
+    return columns
 
 
-def _cells(data: bytes) -> tuple[list[str], list[list[str]], str]:
+def _numbers(cells: list[str], name: str, mark: str, are_labels: bool) -> NDArray[np.float64]:
+    """Return a column of numbers, or the numbers of labels in their order."""
+    if are_labels:
+        order = [*dict.fromkeys(cells)]
+        return np.array([1.0 + order.index(cell) for cell in cells])
+    values = np.empty(len(cells))
+    for number, cell in enumerate(cells):
+        if (value := _number(cell, mark)) is None:
+            more = " (others have decimal commas)" if mark == "," and "." in cell else ""
+            raise UnreadableFile(
+                f"row {number + 1}, {name}: {format_value(cell)} is not a number{more}"
+            )
+        values[number] = value
+    return values
+
+
+def _cells(data: bytes, headers: Collection[str]) -> tuple[list[str], list[list[str]], str]:
     """Return the column names, the rows of cells as written, and the name of the delimiter."""
     wide = data.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE))
     try:
@@ -240,6 +287,9 @@ def _cells(data: bytes) -> tuple[list[str], list[list[str]], str]:
         line for line in text.splitlines() if line.strip() and not line.lstrip().startswith("#")
     ]
     said = lines.pop(0).strip()[4:] if lines and lines[0].lower().startswith("sep=") else ""
+    if lines and headers:  # the header is the line that has most of them
+        has = [sum(header in line for header in headers) for line in lines]
+        lines = lines[has.index(max(has)) :]
     head = lines[0] if lines else ""
     mark = said or next((one for one in DELIMITERS if one in head.strip()), ",")
     if mark == " " or not mark.isspace():

@@ -152,6 +152,7 @@ STRESS = Dimension("stress", "2.4 kPa", ((STRESS_UNIT, 1),))
 LENGTH = Dimension("length", "5 mm", ((LENGTH_UNIT, 1),))
 AREA = Dimension("area", "10 mm^2", ((LENGTH_UNIT, 2),))
 FORCE = Dimension("force", "300 mN", ((STRESS_UNIT, 1), (LENGTH_UNIT, 2)))
+TENSION = Dimension("force per length", "20 N/m", ((STRESS_UNIT, 1), (LENGTH_UNIT, 1)))
 TEMPERATURE = Dimension("temperature", "37 degC", (("K", 1),))
 FOUNDATION = Dimension("stress per length", "10 kPa/mm", ((STRESS_UNIT, 1), (LENGTH_UNIT, -1)))
 NUMBER_DENSITY = Dimension("number per volume", "2e21 / m^3", (("m", -3),))
@@ -178,11 +179,10 @@ def dimension_of(field: FieldInfo) -> Dimension | None:
     return next((entry for entry in field.metadata if isinstance(entry, Dimension)), None)
 
 
-def factor_to_scene(unit: str, dimension: Dimension, units: Mapping[str, str | None]) -> float:
-    """Return the factor from another unit to the scene's unit of a dimension."""
+def factor_to_scene(unit: str, dimension: Dimension) -> float:
+    """Return the factor from another unit to the scene's unit (`scene_units`) of a dimension."""
     try:
-        with scene_units(units):
-            return float(dimension.number(f"1 {unit}"))
+        return float(dimension.number(f"1 {unit}"))
     except PydanticCustomError as error:
         raise ValueError(error.message()) from error
 

@@ -11,7 +11,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import closing, suppress
 from dataclasses import dataclass, field, replace
 from functools import cached_property, partial
-from itertools import zip_longest
+from itertools import pairwise, zip_longest
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING, Annotated, Literal
@@ -24,21 +24,25 @@ from pydantic import Field, model_validator
 
 from remodel_fenicsx._version import __version__
 from remodel_fenicsx.body.reductions import describe_choice
+from remodel_fenicsx.model.cells import turned_about_z
 from remodel_fenicsx.errors import BAD_ENVIRONMENT, SOLVE_FAILED, RemodelError, UnreadableFile
 from remodel_fenicsx.results.run_folder import chosen_folder
 from remodel_fenicsx.results.recording import RunLock
 from remodel_fenicsx.scene.scene import Scene, SceneError
-from remodel_fenicsx.schema.settings import Load
-from remodel_fenicsx.schema.tables import Table, validation_error, format_value
+from remodel_fenicsx.schema.settings import TURNOVER_POWER, Load
+from remodel_fenicsx.schema.tables import Table, format_value, listed, validation_error
 from remodel_fenicsx.schema.text import read_columns, read_toml
 from remodel_fenicsx.schema.units import (
+    AREA,
     FORCE,
     LENGTH,
     LENGTH_UNIT,
     STRESS,
     STRESS_UNIT,
+    TENSION,
     convention_doubt,
     factor_to_scene,
+    scene_units,
 )
 from remodel_fenicsx.initial import resolve_auto_settings
 from remodel_fenicsx.simulation import Simulation, reset_simulation
@@ -68,12 +72,22 @@ if TYPE_CHECKING:
 log = logging.getLogger(__name__)
 
 Array = NDArray[np.float64]
+Integers = NDArray[np.int64]
 Columns = dict[str, Array]
 
 
 # ---------------------------------------------------------------- data, checked before any solve
 LARGEST_TABLE = 10**7  # bytes: a hundred thousand rows
 DIMENSIONS = {"stress": STRESS, "length": LENGTH, "stress * length^2": FORCE, "force": FORCE}
+PROTOCOL = "protocol"  # the column of labels of protocols
+NOT_MEASURED = {
+    *(
+        "max_chain_extension min_jacobian stored_energy remodeling_power newton_iterations "
+        "linear_iterations substeps seconds pass_residual time_error negative_eigenvalues "
+        "inactive_fraction asleep_share cpu_seconds processor_seconds"
+    ).split(),
+    TURNOVER_POWER,
+}
 SCALE = "scale."  # prefix of the keys of factors on columns
 SCALE_BOUNDS = (1e-3, 1e3)  # bounds of factors on columns
 WIDE = 1e3  # default bound over the start
@@ -87,6 +101,7 @@ Positive = Annotated[float, Field(gt=0)]
 _Number = Annotated[
     Positive | None, Field(json_schema_extra={"allowed": "a finite number greater than 0"})
 ]
+_Values = str | float | list[str | float]
 
 
 class Unknown(Table):
@@ -130,6 +145,21 @@ class MeasuredTable(Table):
         default={}, json_schema_extra={"allowed": "'unknown' by column"}
     )
     units: dict[str, str] = Field(default={}, json_schema_extra={"allowed": "units by column"})
+    columns: dict[str, str] = Field(
+        default={}, json_schema_extra={"allowed": "headers of the file by column"}
+    )
+    rows: Literal["all", "loading", "last loading"] | dict[str, _Values] = Field(
+        default="all",
+        json_schema_extra={
+            "allowed": "'all', 'loading', 'last loading', or a table of headers with their values"
+        },
+    )
+    protocols: tuple[int, ...] = Field(
+        default=(), strict=False, json_schema_extra={"allowed": "numbers of protocols to fit"}
+    )
+    area: Annotated[_Number, AREA] = None
+    length: Annotated[_Number, LENGTH] = None
+    thickness: Annotated[_Number, LENGTH] = None
     drive: tuple[str, ...] = Field(
         default=(), strict=False, json_schema_extra={"allowed": "names of columns of loads"}
     )
@@ -173,6 +203,7 @@ class Measured:
     scaled: tuple[str, ...]
     # The file's units that differ from the scene's, with their factors to the scene's units.
     units: dict[str, tuple[str, float]]
+    is_fitted: bool = True  # or only predicted
 
     @property
     def rows(self) -> int:
@@ -185,27 +216,24 @@ class Measured:
         return [*same, *self.loads, "time"][0]
 
     @property
-    def protocols(self) -> list[NDArray[np.int64]]:
-        """Rows of each protocol, in order; loads decrease by over half between two protocols."""
-        sizes = [
-            np.abs(self.columns[name]) / (np.abs(self.columns[name]).max() or 1.0)
-            for name in self.loads
-        ]
-        size = np.max([np.zeros(self.rows), *sizes], axis=0)
-        return np.split(np.arange(self.rows), np.flatnonzero(np.diff(size) < -0.5) + 1)
+    def protocols(self) -> dict[int, Integers]:
+        """Rows of each protocol, by its number."""
+        number = self.columns[PROTOCOL]
+        return {int(one): np.flatnonzero(number == one) for one in np.unique(number)}
 
 
 def read_measurements(path: Path, scene: Scene) -> tuple[dict[str, Unknown], list[Measured]]:
     """Read DATA.toml and check it with a scene; return unknowns by key, with bounds, and tables."""
-    data = DataFile(**read_toml(path))
-    measured = [
-        _measured(table, f"measured[{number}]", path.parent, scene)
-        for number, table in enumerate(data.measured)
-    ]
+    units = {STRESS_UNIT: scene.material.stress_unit, LENGTH_UNIT: scene.geometry.length_unit}
+    with scene_units(units):
+        data = DataFile(**read_toml(path))
+        measured = [
+            part
+            for number, table in enumerate(data.measured)
+            for part in _measured(table, f"measured[{number}]", path.parent, scene)
+        ]
     starts = {key: unknown.start for key, unknown in data.unknowns.items()}
-    for key, start in starts.items():
-        scene.with_values({key: start})  # raises for unknown keys and invalid numbers
-    scene.with_values(starts)  # raises for invalid combinations
+    scene.with_values(starts)  # raises for unknown keys, invalid numbers and combinations
     unknowns = {
         key: _bounded(key, unknown, scene, starts) for key, unknown in data.unknowns.items()
     }
@@ -213,7 +241,7 @@ def read_measurements(path: Path, scene: Scene) -> tuple[dict[str, Unknown], lis
         unknowns[f"{SCALE}{name}"] = Unknown(
             start=1.0, lower=SCALE_BOUNDS[0], upper=SCALE_BOUNDS[1]
         )
-    if len(unknowns) > sum(table.rows * len(table.sd) for table in measured):
+    if len(unknowns) > sum(table.rows * len(table.sd) for table in measured if table.is_fitted):
         raise SceneError(f"unknowns: {len(unknowns)} unknowns need at least as many measurements")
     return unknowns, measured
 
@@ -223,19 +251,20 @@ def _bounded(key: str, unknown: Unknown, scene: Scene, starts: Mapping[str, floa
 
     def allowed(logarithm: float) -> bool:
         # The start times a factor is allowed alone, or if all unknowns have the same factor, with
-        # which a wall keeps its shape.
+        # which a wall keeps its shape, or if another one is small, as of fractions with a sum.
         number = float(np.exp(logarithm))
         moved = {other: start * number / unknown.start for other, start in starts.items()}
-        for values in ({**starts, key: number}, moved):
+        small = [{**starts, other: start / WIDE} for other, start in starts.items()]
+        for values in (starts, moved, *small):
             with suppress(SceneError):
-                return bool(scene.with_values(values))
+                return bool(scene.with_values({**values, key: number}))
         return False
 
     ends = []
     for bound, end in zip((unknown.lower, unknown.upper), unknown.bounds, strict=True):
         inside, outside = np.log([unknown.start, end])
         if bound is not None and not allowed(outside):
-            scene.with_values({key: bound})  # raises for the bound in DATA.toml
+            scene.with_values({**starts, key: bound})  # raises for the bound in DATA.toml
         back = FROM_EDGE * np.sign(inside - outside)
         if not allowed(outside - back):
             while abs(outside - inside) > FROM_EDGE:
@@ -251,28 +280,25 @@ def _bounded(key: str, unknown: Unknown, scene: Scene, starts: Mapping[str, floa
     return unknown.model_copy(update=dict(zip(("lower", "upper"), ends, strict=True)))
 
 
-def _measured(table: MeasuredTable, place: str, folder: Path, scene: Scene) -> Measured:
+def _measured(table: MeasuredTable, place: str, folder: Path, scene: Scene) -> Iterator[Measured]:
+    """Yield the rows to fit, and those to predict, in the scene's units."""
     on = [f"remodeling.{one.name}" for one in scene.remodeling.processes if one.is_on]
     if table.state == "after" and on:
         raise SceneError(
             f"{place}.state = 'after': takes cells alone, not what {on[0]} has changed"
         )
     file = f"{place}.file = {format_value(table.file)}"
-    columns = _read_columns(folder / table.file, file, scene)
+    columns, units = _read_columns(table, folder, place, scene)
+    labels = columns.pop(PROTOCOL, None)
     loads = _prescribed(columns, table, scene, place)
     _check_columns(columns, loads, table.state, file, scene)
-    for key in ("units", "sd", "scale"):
+    for key in ("sd", "scale"):
         for name in getattr(table, key):
-            if name not in columns or (name == "time" and key != "units"):
+            if name not in columns or name == "time":
                 raise SceneError(
                     f"{place}.{key}.{name}: no such column is measured; the file has "
                     f"{', '.join(columns)}"
                 )
-    units = {
-        name: (unit, _factor(name, unit, scene, f"{place}.units.{name} = {format_value(unit)}"))
-        for name, unit in table.units.items()
-    }
-    columns |= {name: columns[name] * factor for name, (_, factor) in units.items()}
     for name in columns:
         if (name in loads or name == "time") == (name in table.sd):
             rule = (
@@ -281,16 +307,66 @@ def _measured(table: MeasuredTable, place: str, folder: Path, scene: Scene) -> M
                 else "missing: each measured column needs a standard deviation"
             )
             raise SceneError(f"{place}.sd.{name}: {rule}")
-    return Measured(
-        table.file,
-        table.state,
-        table.time or 0.0,
-        columns,
-        loads,
-        table.sd,
-        tuple(table.scale),
-        units,
-    )
+    rows, numbers = _rows(columns, loads, labels, table)
+    if others := {*table.protocols} - {*numbers}:
+        known = ", ".join(map(str, np.unique(numbers)))
+        raise SceneError(f"{place}.protocols = {min(others)}: no such protocol; there are {known}")
+    fitted = np.isin(numbers, table.protocols or numbers)
+    columns[PROTOCOL] = numbers.astype(np.float64)
+    for is_fitted in (True, False):
+        if (kept := rows[fitted[rows] == is_fitted]).size:
+            yield Measured(
+                table.file,
+                table.state,
+                table.time or 0.0,
+                {name: values[kept] for name, values in columns.items()},
+                loads,
+                table.sd,
+                tuple(table.scale),
+                units,
+                is_fitted,
+            )
+
+
+def _rows(
+    columns: Columns, loads: tuple[str, ...], labels: Array | None, table: MeasuredTable
+) -> tuple[Integers, Integers]:
+    """Return the chosen rows, and the numbers of the protocols of all rows; log hysteresis."""
+    sizes = [np.abs(columns[name]) / (np.abs(columns[name]).max() or 1.0) for name in loads]
+    size = np.max([np.zeros(len(next(iter(columns.values())))), *sizes], axis=0)
+    # Without labels loads decrease by over half between two protocols.
+    jumps = 1 + np.cumsum(np.diff(size, prepend=0.0) < -0.5)
+    number: Integers = (jumps if labels is None else labels).astype(np.int64)
+    chosen, gaps = list[Integers](), dict.fromkeys(table.sd, 0.0)
+    for one in np.unique(number):
+        rows = np.flatnonzero(number == one)
+        parts = [rows[part] for part in _cycles(size[rows])]
+        of_loading = {"loading": parts[::2], "last loading": parts[-2::2]}
+        chosen += of_loading.get(str(table.rows), [rows])
+        up, down = parts[-2], parts[-1][np.argsort(size[parts[-1]])]
+        for name, gap in gaps.items() if len(down) > 2 else ():
+            unloaded = np.interp(size[up], size[down], columns[name][down])
+            gaps[name] = max(gap, abs(np.mean(columns[name][up] - unloaded)) / table.sd[name])
+    log.info("%s: %d of %d rows are used", table.file, sum(map(len, chosen)), len(size))
+    for name, gap in gaps.items():
+        if gap > 1.0:
+            words = "loading and unloading differ by %.2g standard deviations on the mean"
+            remedy = "the model has no hysteresis; rows = 'last loading' takes loading alone"
+            log.warning(f"%s, %s: {words}; {remedy}", table.file, name, gap)
+    return np.concatenate(chosen), number
+
+
+def _cycles(size: Array) -> list[Integers]:
+    """Return the rows of each loading and unloading, in turns, from the size of the loads."""
+    half, turns = np.ptp(size) / 2, [0]
+    for row, present in enumerate(size):
+        further = (present - size[turns[-1]]) * (-1) ** len(turns)
+        if further >= 0:
+            turns[-1] = row
+        elif further < -half:
+            turns.append(row)
+    turns += [len(size) - 1] * max(3 - len(turns), 1 - len(turns) % 2)
+    return [np.arange(first, last + 1) for first, last in pairwise(turns)]
 
 
 def _prescribed(
@@ -314,36 +390,82 @@ def _prescribed(
     )
 
 
-def _factor(name: str, unit: str, scene: Scene, place: str) -> float:
-    if (dimension := DIMENSIONS.get(dimensions(scene).get(name, ""))) is None:
-        raise SceneError(f"{place}: {name} takes no unit")
-    units = {STRESS_UNIT: scene.material.stress_unit, LENGTH_UNIT: scene.geometry.length_unit}
-    try:
-        return factor_to_scene(unit, dimension, units)
-    except ValueError as error:
-        raise SceneError(f"{place}: {error}") from error
+def _factor(
+    name: str, unit: str, table: MeasuredTable, place: str, scene: Scene
+) -> tuple[float, str]:
+    """Return the factor to the scene's unit, and the key by whose value it is divided, or ""."""
+    own = dimensions(scene).get(name, "")
+    if unit == "%" and not own:
+        return 0.01, ""
+    choices = {"": DIMENSIONS[own]} if own in DIMENSIONS else {}
+    if "nominal_stress" in name:
+        choices |= {"area": FORCE, "thickness": TENSION}
+    elif re.search("elongation|stretch|shear", name):
+        choices |= {"length": LENGTH}
+    problems = [] if choices else [f"{name} takes no unit"]
+    for key, dimension in choices.items():
+        try:
+            factor = factor_to_scene(unit, dimension)
+        except ValueError as error:
+            problems.append(str(error))
+            continue
+        if (by := getattr(table, key) if key else 1.0) is None:
+            raise SceneError(f"{place}: needs {key}, by which it is divided")
+        return factor / by, key
+    raise SceneError(f"{place}: {'; '.join(problems)}")
 
 
-def _read_columns(path: Path, place: str, scene: Scene) -> Columns:
-    known = {*dimensions(scene)} - {"seconds", "substeps"}
-    strains = {
-        name.replace("elongation", "stretch"): name
-        for name in scene.load_kinds
-        if "elongation" in name
-    }
-    allowed = sorted({*scene.loads, *known, "time", *strains})
+def _read_columns(
+    table: MeasuredTable, folder: Path, place: str, scene: Scene
+) -> tuple[Columns, dict[str, tuple[str, float]]]:
+    """Read the columns in the scene's units, and the units of those that have others."""
+    file, path = f"{place}.file = {format_value(table.file)}", folder / table.file
+    stretches = [load.replace("elongation", "stretch") for load in scene.load_kinds]
+    known = dict.fromkeys([*scene.loads, *dimensions(scene), *stretches, "time", PROTOCOL])
+    allowed = [name for name in known if name not in NOT_MEASURED]
+    for key in table.columns:
+        if key not in allowed:
+            raise SceneError(
+                f"{place}.columns.{key}: unknown column; allowed: {listed(allowed, key)}"
+            )
+    chosen = table.rows if isinstance(table.rows, dict) else {}
+    values_of = {name: one if isinstance(one, list) else [one] for name, one in chosen.items()}
     try:
-        columns = read_columns(read_regular(path, LARGEST_TABLE), path.name, allowed)
+        data = read_regular(path, LARGEST_TABLE)
+        columns = read_columns(
+            data,
+            path.name,
+            allowed,
+            headers=table.columns,
+            chosen=values_of,
+            labels=PROTOCOL,
+        )
     except (OSError, ForeignFileError, UnreadableFile) as error:
-        raise SceneError(f"{place}: {getattr(error, 'strerror', None) or error}") from error
-    for stretch, strain in strains.items():
-        if stretch in columns and strain in columns:
-            raise SceneError(f"{place}: has both {stretch} and {strain}")
+        raise SceneError(f"{file}: {getattr(error, 'strerror', None) or error}") from error
+    units = {}
+    for name, unit in table.units.items():
+        key = f"{place}.units.{name}"
+        if name not in columns:
+            raise SceneError(
+                f"{key}: no such column is measured; the file has {', '.join(columns)}"
+            )
+        factor, by = _factor(name, unit, table, f"{key} = {format_value(unit)}", scene)
+        columns[name] *= factor
+        if not by:
+            units[name] = unit, factor
     # These warnings come before any solve, which may fail because of their cause.
-    for name in {*columns} & {*strains, *scene.load_kinds}:
+    for name in {*columns} & {*stretches, *scene.load_kinds}:
         if words := convention_doubt(name, columns[name]):
             log.warning("%s, %s: %s", path.name, name, words)
-    return {strains.get(name, name): values - (name in strains) for name, values in columns.items()}
+    for name in [*columns]:
+        load = re.sub("stretch|green_strain", "elongation", name)
+        if load == name or load not in scene.load_kinds or name in table.sd:
+            continue
+        if load in columns:
+            raise SceneError(f"{file}: has both {name} and {load}")
+        values = columns.pop(name)
+        columns[load] = (np.sqrt(1.0 + 2.0 * values) if "green" in name else values) - 1.0
+    return columns, units
 
 
 def _check_columns(
@@ -394,6 +516,7 @@ def data_warnings(
 TISSUE = r"(regions\.\w+\.)?(material\.[\w.]+|remodeling\.(kappa|half_life))"
 OTHERS = r"loads\.\w+\.value|natural\.\w+"
 CAN_BE_SET = rf"scale\..*|{TISSUE}|{OTHERS}"
+OF_CELLS = r"cells\.(fraction_[xy]|mean_angle)"  # for runs whose cells are set
 # With these tolerances only rounding errors are amplified by difference quotients of runs.
 PRECISE = {"solver.relative_tolerance": 1e-13, "solver.absolute_tolerance": 0.0}
 
@@ -409,9 +532,11 @@ def model_of(
         end = max(float(step * np.ceil(measured.max() / step - 1e-9)), step)
         columns, _ = _run(scene.with_values({"time.end": end}), table, kept)
         return {name: np.interp(measured, columns["time"], columns[name]) for name in table.sd}
-    start = None
+    start, cells = None, scene.cells
     if table.state == "after":
         _, start = _run(scene.with_values({"time.end": table.time}), table, kept)
+    elif cells.axes == "global" and not (scene.regions or isinstance(cells.initial, str)):
+        start = cells.dimensions(1), turned_about_z(np.eye(3), cells.mean_angle)
     columns, _ = _run(_passive(scene, table, scales), table, kept, start)
     return {name: columns[name][columns["time"] > 0] for name in table.sd}
 
@@ -454,8 +579,9 @@ class SimulationCache(dict[object, tuple[Simulation, Snapshot]]):
         """Return a simulation of the scene at t = 0, a cached one if possible."""
         use = id(table), has_own_cells, scene.model.kinematics, scene.mesh.formulation
         if use in self:
+            can_be_set = CAN_BE_SET if has_own_cells else rf"{CAN_BE_SET}|{OF_CELLS}"
             if all(
-                re.fullmatch(CAN_BE_SET, key) for key in self.keys_of_scene
+                re.fullmatch(can_be_set, key) for key in self.keys_of_scene
             ) and reset_simulation(*self[use], scene):
                 return self[use][0]
             self.pop(use)[0].close()
@@ -558,6 +684,7 @@ class Problem:
     def __init__(self, scene: Scene, unknowns: Mapping[str, Unknown], tables: Sequence[Measured]):
         self.scene, self.unknowns = scene, dict(unknowns)
         self.tables = list(tables)
+        self.fitted = [table for table in tables if table.is_fitted]
         self.bounds = np.log([unknown.bounds for unknown in unknowns.values()])
         self.known: dict[Point, Array] = {}
         self.journal: Path | None = None
@@ -571,6 +698,16 @@ class Problem:
         self.journal.write_text(
             head + "".join(_line(*item) for item in self.known.items()), encoding="utf-8"
         )
+
+    def start_near(self, first: Array, random: np.random.Generator) -> Array:
+        """Draw a start within a factor of two, or of less where the scene takes no such numbers."""
+        spread = START_SPREAD
+        while True:
+            point = first + random.uniform(-spread, spread, len(first))
+            with suppress(SceneError):
+                self.scene_of(np.clip(point, *self.bounds.T))
+                return point
+            spread *= 0.8
 
     def scene_of(self, logarithms: Array) -> Scene:
         """Return the scene with these parameters."""
@@ -589,10 +726,15 @@ class Problem:
     def _numbers(self, logarithms: Array) -> zip[tuple[str, float]]:
         return zip(self.unknowns, map(float, np.exp(logarithms)), strict=True)
 
-    def predictions(self, logarithms: Array, kept: SimulationCache | None = None) -> list[Columns]:
-        """Compute the model's values at the measurements of each table."""
+    def predictions(
+        self,
+        logarithms: Array,
+        kept: SimulationCache | None = None,
+        tables: Sequence[Measured] | None = None,
+    ) -> list[Columns]:
+        """Compute the model's values at the measurements of tables, by default of all."""
         scene, scales = self.scene_of(logarithms), self.scales_of(logarithms)
-        return [model_of(scene, table, scales, kept) for table in self.tables]
+        return [model_of(scene, table, scales, kept) for table in tables or self.tables]
 
     def residuals(self, logarithms: Array) -> Array:
         """Return (model - measurement) / standard deviation, table by table; then the priors."""
@@ -609,9 +751,9 @@ class Problem:
         scales, models = self.scales_of(x), list[Columns]()
         # Invalid combinations of numbers have no equilibrium either.
         with suppress(StepFailure, SceneError):
-            models = self.predictions(x, self.kept)
+            models = self.predictions(x, self.kept, self.fitted)
         parts: list[ArrayLike] = []
-        for table, model in zip_longest(self.tables, models):
+        for table, model in zip_longest(self.fitted, models):
             for name, sd in table.sd.items():
                 difference = (
                     model[name] - scales.get(name, 1.0) * table.columns[name]
@@ -759,10 +901,7 @@ def fit(
         random = np.random.default_rng(1)
         points = [
             first,
-            *(
-                first + random.uniform(-START_SPREAD, START_SPREAD, len(first))
-                for _ in range(starts - 1)
-            ),
+            *(problem.start_near(first, random) for _ in range(starts - 1)),
         ]
         rough = partial(minimised, near=(first, jacobian), enough=PROFILE_TOLERANCE)
         with closing(_FitStudy("fit", scene, parts, {}, jobs, quiet)) as study:
@@ -1007,6 +1146,20 @@ class Fit(StudyResult):
             text += f" Correlated: {', '.join(together)}; take their intervals from --profiles."
         return text
 
+    @property
+    def notes(self) -> list[str]:  # type: ignore[override]
+        """Coefficients of determination of the protocols that are predicted, a line each."""
+        scales, lines = self.problem.scales_of(self.logarithms), []
+        for table, model in zip(self.problem.tables, self.modelled, strict=True):
+            for number, rows in ({} if table.is_fitted else table.protocols).items():
+                scores = f"{table.name}, protocol {number}, predicted: R²"
+                for name in table.sd:
+                    values = scales.get(name, 1.0) * table.columns[name][rows]
+                    missed = np.mean((model[name][rows] - values) ** 2) / np.var(values)
+                    scores += f" {1 - missed:.3f} of {name}"
+                lines.append(scores)
+        return lines
+
     def write(self, folder: Path) -> None:
         """Write the tables and the picture into a folder."""
         super().write(folder)
@@ -1017,9 +1170,9 @@ class Fit(StudyResult):
     def figure(self) -> Figure:
         """Plot each measured column of each protocol over its prescribed load, or time."""
         shown = [
-            (table, model[name], name, rows, f", protocol {number} of {len(table.protocols)}")
+            (table, model[name], name, rows, f", protocol {number}")
             for table, model in zip(self.problem.tables, self.modelled, strict=True)
-            for number, rows in enumerate(table.protocols, start=1)
+            for number, rows in table.protocols.items()
             for name in table.sd
         ]
         (figure, grid), scales = panels(len(shown), 2.6), self.problem.scales_of(self.logarithms)
@@ -1039,9 +1192,10 @@ class Fit(StudyResult):
                 color=COLOURS[0],
                 label="measured",
             )
-            axes.plot(x / per_x, model[rows] / per, color=COLOURS[1], label="fitted model")
+            words = "fitted model" if table.is_fitted else "predicted"
+            axes.plot(x / per_x, model[rows] / per, color=COLOURS[1], label=words)
             title = f"{Path(table.name).name} ({table.state})"
-            axes.set_title(title + which if len(table.protocols) > 1 else title, fontsize=8)
+            axes.set_title(title + which, fontsize=8)
             axes.set(
                 xlabel=label(self.scene, over, unit_of_x), ylabel=label(self.scene, name, unit)
             )

@@ -13,7 +13,7 @@ import math
 import textwrap
 import time as clock
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from concurrent.futures import FIRST_COMPLETED, Future, wait
 from contextlib import closing
 from dataclasses import dataclass
@@ -45,6 +45,7 @@ from remodel_fenicsx.results.recording import (
 from remodel_fenicsx.running import with_stored_files
 from remodel_fenicsx.scene import Scene
 from remodel_fenicsx.scene.scene import SceneError
+from remodel_fenicsx.schema.units import dimension_of
 from remodel_fenicsx.initial import resolve_auto_settings
 from remodel_fenicsx.system.environment import versions
 from remodel_fenicsx.system.children import POLL, Cluster, Threads
@@ -203,6 +204,29 @@ def label(scene: Scene, name: str, unit: str = "") -> str:
     """Return the label of a column or load, with its unit; by default the scene's unit, if any."""
     unit = unit or unit_of(scene, dimensions(scene).get(name, ""))
     return words(name) + (f", {unit}" if unit else "")
+
+
+def label_of_key(scene: Scene, key: str) -> str:
+    """Return the label of a key with its unit, such as "pressure, kPa" of loads.pressure.value."""
+    *parents, name = key.split(".")
+    if parents[0] == "loads":
+        return label(scene, parents[1])
+    field = getattr(type(value_at(scene, parents)), "model_fields", {}).get(name)
+    dimension = "degrees" if "angle" in name else getattr(field and dimension_of(field), "name", "")
+    unit = {"temperature": "K", "number per volume": "1/m³"}.get(dimension, dimension)
+    return label(scene, " ".join([*parents[1:2], name]), unit_of(scene, unit))
+
+
+def value_at(scene: Scene, parts: Iterable[str]) -> object:
+    """Return the value of a scene at the parts of a dotted key."""
+    there: Any = scene
+    for part in parts:
+        there = (
+            there[int(part)]
+            if isinstance(there, tuple)
+            else (there[part] if isinstance(there, Mapping) else getattr(there, part))
+        )
+    return there
 
 
 def dimensions(scene: Scene) -> dict[str, str]:

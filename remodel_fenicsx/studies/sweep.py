@@ -26,7 +26,9 @@ from remodel_fenicsx.studies.study import (
     TooFewRuns,
     aligned,
     label,
+    label_of_key,
     panels,
+    value_at,
 )
 from remodel_fenicsx.system.files import MOST_RUNS
 
@@ -204,21 +206,26 @@ class Sweep(StudyResult):
             axes, order = grid[row, column], np.argsort(self.values[key])
             look = "o-" if len(self.values) == 1 else "o"
             axes.plot(self.values[key][order], self.ends[name][order], look)
-            axes.set(xlabel=key, ylabel=label(self.scene, name))
+            axes.set(xlabel=label_of_key(self.scene, key), ylabel=label(self.scene, name))
             axes.label_outer()
         return figure
 
 
 def sweep(
     scene: Scene,
-    points: Sequence[Point],
+    points: Sequence[Point] | Mapping[str, Sequence[Number]] | str,
     folder: Path | str | None = None,
     jobs: int | None = None,
     quiet: bool = True,
     sampled: bool = False,
     scheduler: str | None = None,
 ) -> tuple[Path, Sweep]:
-    """Run a scene at each point. Points without a valid scene raise, or fail if `sampled`."""
+    """Run a scene at each point. Points without a valid scene raise, or fail if `sampled`.
+
+    Points are also all combinations of the numbers of keys, or of words "KEY=a:b:n KEY=a,b,...".
+    """
+    axes = read_axes(points.split()) if isinstance(points, str) else points
+    points = grid(axes) if isinstance(axes, Mapping) else axes
     if not FEWEST_RUNS <= len(points) <= MOST_RUNS:
         raise SceneError(f"sweep: {len(points)} runs; must be {FEWEST_RUNS} to {MOST_RUNS}")
     named = {
@@ -258,14 +265,7 @@ def _changed(scene: Scene, point: Point) -> Scene:
     """Return the scene at a point. Some keys accept numbers but do not store them; these raise."""
     changed = scene.with_values({**point, "output.fields": False})
     for key, value in point.items():
-        there: Any = changed
-        for part in key.split("."):
-            there = (
-                there[int(part)]
-                if isinstance(there, tuple)
-                else (there[part] if isinstance(there, Mapping) else getattr(there, part))
-            )
-        if there != value:
+        if value_at(changed, key.split(".")) not in (value, None):
             raise SceneError(f"sweep {key}: this key does not take a number")
     return changed
 

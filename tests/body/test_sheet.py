@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
 from remodel_fenicsx import Scene, SceneError, read_scene
 from remodel_fenicsx.studies.fit import model_of, read_measurements
@@ -17,6 +18,7 @@ from tests.tables import rows, values
 from tests.values import ramped
 
 DEMOS = Path(__file__).parents[2] / "demos"
+GREEN, SECOND = "green_strain", "second_piola_kirchhoff_stress"
 STIFF = {"lame_lambda": 31030.0, "lame_mu": 3.103, "repulsion": "log"}
 
 
@@ -38,7 +40,15 @@ def sheet(loads: dict[str, float], **tables: Any) -> Scene:
 @pytest.mark.parametrize(
     "material", [{"repulsion": "log"}, STIFF], ids=["soft", "nearly incompressible"]
 )
-@pytest.mark.parametrize("cells", ["isotropic", [0.6, 0.8, 0.0]], ids=["isotropic", "in plane"])
+@pytest.mark.parametrize(
+    ("cells", "fractions", "angle"),
+    [
+        ({"initial": "isotropic"}, (1 / 3, 1 / 3), 0.0),
+        ({"initial": [0.6, 0.8, 0.0]}, (0.36, 0.64), 0.0),
+        ({"fraction_x": 0.5, "fraction_y": 0.3, "mean_angle": 30.0}, (0.5, 0.3), 30.0),
+    ],
+    ids=["isotropic", "in plane", "oblique"],
+)
 @pytest.mark.parametrize(
     "loads",
     [
@@ -52,18 +62,26 @@ def sheet(loads: dict[str, float], **tables: Any) -> Scene:
     ids=" ".join,
 )
 def test_stresses_are_those_of_a_point_typed_by_hand(
-    loads: dict[str, float], cells: Any, material: Any
+    loads: dict[str, float],
+    cells: dict[str, Any],
+    fractions: tuple[float, float],
+    angle: float,
+    material: Any,
 ) -> None:
-    row = last_row(sheet(loads, cells={"initial": cells}, material=material))
+    asked = [f"{name}_{axis}" for name in (GREEN, SECOND) for axis in ("x", "y", "xy")]
+    row = last_row(sheet(loads, cells=cells, material=material, output={"columns": asked}))
     F = np.diag([1 + row["elongation_x"], 1 + row["elongation_y"], row["thickness_stretch"]])
     F[0, 1] = row["shear"]
-    lengths = np.full(3, 3**-0.5) if cells == "isotropic" else np.array(cells)
-    A = np.diag(lengths**2)
+    turned = Rotation.from_euler("z", angle, degrees=True).as_matrix()
+    A = turned @ np.diag([*fractions, 1 - sum(fractions)]) @ turned.T
     known = RadialMaterial(lame_lambda=material.get("lame_lambda", 27.293))
     sigma = cauchy(F, A, repulsion_of_logarithm(F, A), known)
     nominal = np.linalg.det(F) * sigma @ np.linalg.inv(F).T
     close = {"rel": 1e-8, "abs": 1e-8 * known.lame_lambda}
+    strain, second = (F.T @ F - np.eye(3)) / 2, np.linalg.inv(F) @ nominal
     for name, i, j in (("x", 0, 0), ("y", 1, 1), ("xy", 0, 1)):
+        assert row[f"{GREEN}_{name}"] == pytest.approx(strain[i, j], abs=1e-12)
+        assert row[f"{SECOND}_{name}"] == pytest.approx(second[i, j], **close)
         assert row[f"cauchy_stress_{name}"] == pytest.approx(sigma[i, j], **close)
         assert row[f"nominal_stress_{name}"] == pytest.approx(nominal[i, j], **close)
     assert row["nominal_stress_yx"] == pytest.approx(nominal[1, 0], **close)

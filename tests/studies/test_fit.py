@@ -196,7 +196,7 @@ def test_the_picture_has_panels_for_each_protocol(tmp_path: Path) -> None:
     )[1]
     panels = [panel for panel in found.figure().axes if panel.axison]
     assert [panel.get_title() for panel in panels[::2]] == [
-        f"d.csv (virgin), protocol {n} of 3" for n in (1, 2, 3)
+        f"d.csv (virgin), protocol {n}" for n in (1, 2, 3)
     ]
     for axis, name in enumerate(("nominal_stress_x", "nominal_stress_y")):
         points, model = ([panel.lines[n] for panel in panels[axis::2]] for n in (0, 1))

@@ -13,7 +13,8 @@ import pytest
 from remodel_fenicsx import cli, preset_scene
 from remodel_fenicsx.results.recording import RunLock
 from remodel_fenicsx.results.status import status
-from remodel_fenicsx.studies.sweep import latin_hypercube, read_axes
+from remodel_fenicsx.studies.study import label_of_key
+from remodel_fenicsx.studies.sweep import latin_hypercube, read_axes, sweep
 from tests.conftest import Refused, forked_children
 from tests.tables import rows as table
 
@@ -27,6 +28,23 @@ def cube(tmp_path: Path) -> Path:
     path = tmp_path / "cube.toml"
     path.write_text(preset_scene(PAPER, "cube").with_values(changes).to_toml())
     return path
+
+
+def test_keys_are_those_of_people_from_python_too(tmp_path: Path) -> None:
+    """A key that the scene converts, by words and by numbers: the same runs; the axis has its unit."""
+    changes = {"model.kinematics": "point", "time.end": 2.0, "geometry.length_unit": "mm"}
+    scene = preset_scene(PAPER, "cube").with_values(changes)
+    stiffness = {"material.initial_stiffness": [5.0, 10.0], "loads.force.value": [4.0]}
+    words = "material.initial_stiffness=5:10:2 loads.force.value=4"
+    with forked_children():
+        both = [sweep(scene, axes, tmp_path / "out")[1] for axes in (stiffness, words)]
+    first, second = (one.ends["mean_stretch"] for one in both)
+    assert first[0] > first[1] > 1.0 and (first == second).all()
+    labels = [panel.get_xlabel() for panel in both[0].figure().axes[-2:]]
+    assert labels == ["initial stiffness, Pa", "force, µN"]
+    others = {"material.chain_density": "chain density, 1/m³", "natural.opening_angle": "opening angle, °",
+              "geometry.side": "side, mm", "remodeling.kappa": "kappa", "material.temperature": "temperature, K"}  # fmt: skip
+    assert {key: label_of_key(scene, key) for key in others} == others
 
 
 def rows(folder: Path) -> list[dict[str, str]]:
