@@ -218,7 +218,7 @@ def _drawn(
         plotter.camera.zoom(ZOOM)
     plotter.subplot(rows, 0)
     plotter.view_vector(job.direction, up)
-    look = {"n_labels": 7, "fmt": "%.0f", "color": "black", "label_font_size": LETTER}
+    look = {"n_labels": 7, "fmt": "%.0f°", "color": "black", "label_font_size": LETTER}
     plotter.add_scalar_bar(
         job.scale,
         mapper=actor.mapper,
@@ -362,7 +362,7 @@ def _draw(
         for times in sheets
     ]
     along, across = scene.geometry.angle_in_words
-    scale = f"angle of the collagen, deformed: 0 {along}, 90 {across} (degrees)"
+    scale = f"deformed fibre angle: 0° {along}, 90° {across}"
     notes = f"{scene.name}: {len(whole.elements):,} elements. "
     notes += " ".join(whole.notes("displacement" in drawn[0][0][1].point_data))
     images = render(Job(drawn, viewing.direction, scale, textwrap.fill(notes, 110)))
