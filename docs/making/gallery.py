@@ -45,7 +45,7 @@ class Body(NamedTuple):
 
     scene: str
     options: tuple[str, ...] = ()
-    cut: bool = True
+    cut: str = ""  # between "elements", which keep their chains, or by a "plane" through them
     eye: tuple[float, float, float] = FRONT
 
 
@@ -71,16 +71,16 @@ class Fit(NamedTuple):
 BANDS = {f"fibre_angle_{band}": band for band in ("inner", "middle", "outer")}
 ANGLES = "fibre angle, degrees"
 DEMOS: dict[str, Body | Curves | Fit] = {
-    "artery": Body("artery.toml"),
-    "tendon": Body("tendon.toml", cut=False, eye=(0.3, -1.0, 0.14)),
+    "artery": Body("artery.toml", cut="elements"),
+    "tendon": Body("tendon.toml", eye=(0.3, -1.0, 0.14)),
     "cube": Curves("cube.toml", "angle to the load, degrees", {"mean_fibre_angle": ""}),
-    "layers": Body("layers.toml"),
+    "layers": Body("layers.toml", cut="elements"),
     "pulse": Curves("pulse.toml", "inner radius, mm", {"inner_radius": "diastole", "inner_radius@2": "systole"}),
     "sheet": Curves("sheet.toml", ANGLES, {"fibre_angle": ""}),
-    "gel": Body("gel/scene.toml", cut=False),
-    "bent_vessel": Body("bent_vessel/scene.toml", cut=False),
-    "fork": Body("fork/scene.toml", eye=(0.15, -1.0, 0.25)),
-    "own_vessel": Body("own_vessel/scene.toml", eye=(0.0, -1.0, 0.1)),
+    "gel": Body("gel/scene.toml"),
+    "bent_vessel": Body("bent_vessel/scene.toml"),
+    "fork": Body("fork/scene.toml", cut="plane", eye=(0.15, -1.0, 0.25)),
+    "own_vessel": Body("own_vessel/scene.toml", cut="plane", eye=(0.0, -1.0, 0.1)),
     "turnover": Curves("turnover.toml", "opening angle, degrees", {"opening_angle": ""},
                        ("--set", "time.end=1200.0", "--set", "time.step=4.0")),
     "hypertension": Curves("hypertension.toml", "wall thickness", {"wall_thickness": ""}),
@@ -88,7 +88,7 @@ DEMOS: dict[str, Body | Curves | Fit] = {
     "fit": Fit("fit/scene.toml", "fit/inflation.toml", "outer_radius", ("pressure, mmHg", "outer radius, mm")),
     "biaxial": Fit("biaxial/scene.toml", "biaxial/protocols.toml", "nominal_stress_x",
                    ("stretch along x", "nominal stress, kPa")),
-    "torsion": Body("extensions/torsion.toml", ("--with", "demos/extensions/torsion.py"), cut=False),
+    "torsion": Body("extensions/torsion.toml", ("--with", "demos/extensions/torsion.py")),
 }  # fmt: skip
 
 
@@ -115,22 +115,18 @@ def run_all() -> None:
 
 
 # ---------------------------------------------------------------- bodies
-def cut_by_a_plane(grid: Any) -> Any:
-    """Return the half of a body behind the plane through its middle, cut through elements."""
-    return grid.clip("-y", origin=grid.center)
-
-
-def body_image(run: Recording, time: float | None, cut: bool, eye: tuple[float, float, float], size: tuple[int, int],
-               bounds: Any = None) -> np.ndarray:  # fmt: skip
+def body_image(run: Recording, time: float | None, demo: Body, size: tuple[int, int], bounds: Any = None) -> np.ndarray:
     """Draw a deformed body; one that is cut by a plane has no chains, which would lie in the cut."""
     grid, options = run.grid(time), {}
-    if cut:
+    if demo.cut == "elements":
+        grid = grid.extract_cells(grid.cell_centers().points[:, 1] > grid.center[1])
+    elif demo.cut:
+        grid = grid.clip("-y", origin=grid.center)
         options = {"with_chains": False, "show_edges": False}
-        grid = cut_by_a_plane(grid)
     plotter: Any = new_plotter(off_screen=True, window_size=[2 * n for n in size])
     add_body(plotter, grid.warp_by_vector("displacement"), ANGLE, show_scalar_bar=False, line_width=0.5, **options)
     plotter.enable_parallel_projection()
-    plotter.view_vector(eye, (0, 0, 1), bounds=bounds)
+    plotter.view_vector(demo.eye, (0, 0, 1), bounds=bounds)
     plotter.camera.zoom(1.25)
     image = Image.fromarray(np.asarray(plotter.screenshot(return_img=True)))
     plotter.close()
@@ -140,7 +136,7 @@ def body_image(run: Recording, time: float | None, cut: bool, eye: tuple[float, 
 # ---------------------------------------------------------------- thumbnails
 def of_body(axes: Axes, name: str, demo: Body) -> None:
     """Show a body without axes."""
-    axes.imshow(body_image(Recording(WORK / name), None, demo.cut, demo.eye, PIXELS))
+    axes.imshow(body_image(Recording(WORK / name), None, demo, PIXELS))
     axes.set_axis_off()
 
 
@@ -192,7 +188,7 @@ def vessel(name: str) -> Figure:
     figure = Figure(figsize=(6.4, 4.4))
     for number, time in enumerate((0.0, run.times[-1])):
         axes = figure.add_axes((0.02 + 0.49 * number, 0.24, 0.47, 0.68))
-        image = body_image(run, time, True, demo.eye, (640, 600), bounds)
+        image = body_image(run, time, demo, (640, 600), bounds)
         figures.show(axes, image, f"pressure {run.value('pressure', time):.3g} kPa")
         axes.set_title(f"$t$ = {time:g}")
     label = "deformed fibre angle: 0° circumferential, 90° axial"
