@@ -13,9 +13,9 @@ from docs.making.pages import FIGURES, drawn
 from remodel_fenicsx.results.recording import ANGLE_COLOURS
 from remodel_fenicsx.studies.study import COLOURS, Page
 
-DEPTH = np.array([0.42, 0.30])  # where a unit of the third axis goes on the paper
+DEPTH = np.array([0.37, 0.33])  # where a unit of the third axis goes on the paper
 BLUE, RED = COLOURS[:2]
-TURN = np.radians(32.0)  # of the principal stresses of the cell
+TURN = np.radians(-14.0)  # of the principal stresses of the cell
 TISSUE = "#e6e0d6"
 CELL = (
     "The eight-chain unit cell and its remodeling",
@@ -81,13 +81,13 @@ def draw_axes_of_cell(axes: Axes, dimensions: Sequence[float], turn: float, reac
 
 def draw_stresses(axes: Axes, dimensions: Sequence[float], labels: Sequence[str]) -> None:
     """Draw the principal stresses on the faces: two tensions, and a compression along the depth."""
-    for size, along, length, label in zip(dimensions, directions(TURN), (0.55, 0.3, -0.32), labels, strict=True):  # fmt: skip
+    for size, along, length, label in zip(dimensions, directions(TURN), (0.55, 0.3, -0.62), labels, strict=True):  # fmt: skip
         for side in (-1, 1):
             near, far = side * (size + 0.06) * along, side * (size + 0.06 + abs(length)) * along
             arrow(axes, *((near, far) if length > 0 else (far, near)), color=RED, lw=2.2)
-        place = -(size + 0.06 + abs(length)) * along
-        axes.annotate(label, place, (0, -11 if along[1] >= 0 else 8), textcoords="offset points",
-                      ha="center", va="center", color=RED)  # fmt: skip
+        place, beside = -(size + 0.06 + abs(length)) * along, -9 if length > 0 else -4
+        axes.annotate(label, place, (beside, -9), textcoords="offset points", ha="center",
+                      va="center", color=RED)  # fmt: skip
 
 
 def cell() -> Figure:
@@ -102,16 +102,24 @@ def cell() -> Figure:
     left = corners(equal, 0.0)[0, 0]
     arrow(panels[0], (left, bottom), (left + equal[0], bottom), arrowstyle="<|-|>", lw=0.8)
     panels[0].text(left + equal[0] / 2, bottom - 0.05, "$l_1$", ha="center", va="top")
-    panels[0].text(-0.98, -1.08, "chain: end-to-end length $r$,\nlocks at $r = L$", color=BLUE, fontsize=7.5)  # fmt: skip
+    panels[0].text(-1.0, -1.27, "chain: end-to-end length $r$,\nlocks at $r = L$", color=BLUE, fontsize=7.5)  # fmt: skip
     blank(panels[1], "b", "under load: the axes $n_I$ take\nthe principal directions of stress")
     draw_cell(panels[1], equal, TURN, 0.04)
     draw_stresses(panels[1], equal, ("$\\sigma_1$", "$\\sigma_2$", "$\\sigma_3 < 0$"))
-    blank(panels[2], "c", "remodeled: $l_I$ tends to $r_0\\,\\sigma_I^+ / |\\sigma^+|$,\nand $l_3$ vanishes")
+    blank(
+        panels[2],
+        "c",
+        "remodeled: $l_I$ tends to $r_0\\,\\sigma_I^+ / |\\sigma^+|$,\nand $l_3$ vanishes",
+    )
     draw_cell(panels[2], later, TURN, 0.012)
     draw_stresses(panels[2], later, ("$\\sigma_1$", "$\\sigma_2$", "$\\sigma_3 < 0$"))
     chain = np.degrees(TURN + np.arctan2(later[1], later[0]))
-    panels[2].add_patch(Arc((0, 0), 1.15, 1.15, theta1=np.degrees(TURN), theta2=chain, color="black"))
-    panels[2].plot(*(np.linspace(0, 0.88, 2)[:, None] * directions(TURN)[0]).T, ":", color="black", lw=1)
+    panels[2].add_patch(
+        Arc((0, 0), 1.15, 1.15, theta1=np.degrees(TURN), theta2=chain, color="black")
+    )
+    panels[2].plot(
+        *(np.linspace(0, 0.88, 2)[:, None] * directions(TURN)[0]).T, ":", color="black", lw=1
+    )
     panels[2].text(*(0.68 * np.array([np.cos(TURN + 0.23), np.sin(TURN + 0.23)])), "$\\alpha$", ha="center", va="center")  # fmt: skip
     panels[2].text(-1.3, -1.28, "$\\tan\\alpha = l_2 / l_1$", fontsize=8)
     for axes in panels:
@@ -127,7 +135,9 @@ def draw_length(axes: Axes) -> None:
     """Draw the section along the tube: walls, pressure, rollers, elongation and axes."""
     for side in (-1, 1):
         low = min(side * INNER, side * OUTER)
-        axes.add_patch(Rectangle((low, 0), OUTER - INNER, LENGTH, fc=TISSUE, ec="black", hatch="//", lw=1))
+        axes.add_patch(
+            Rectangle((low, 0), OUTER - INNER, LENGTH, fc=TISSUE, ec="black", hatch="//", lw=1)
+        )
         for height in np.linspace(0.35, LENGTH - 0.35, 5):
             arrow(axes, (side * 0.12, height), (side * (INNER - 0.02), height), color=RED)
         for x in np.linspace(low + 0.08, low + OUTER - INNER - 0.08, 3):
@@ -136,9 +146,32 @@ def draw_length(axes: Axes) -> None:
         arrow(axes, (middle, LENGTH + 0.03), (middle, LENGTH + 0.5), color=RED, lw=2)
     axes.plot([-1.2, 1.2], [-0.15, -0.15], color="black", lw=1.2)
     axes.plot([0, 0], [0, LENGTH], "-.", color="0.5", lw=0.8)
-    axes.text(0, 0.62, "$p$", color=RED, ha="center", va="center", bbox={"fc": "white", "ec": "none", "pad": 1})
-    axes.text(0, LENGTH + 0.3, "elongation or\naxial force", color=RED, ha="center", va="center", fontsize=7)
-    axes.text(0, -0.25, "ends keep their planes;\nfree to move radially", ha="center", va="top", fontsize=7)
+    axes.text(
+        0,
+        0.62,
+        "$p$",
+        color=RED,
+        ha="center",
+        va="center",
+        bbox={"fc": "white", "ec": "none", "pad": 1},
+    )
+    axes.text(
+        0,
+        LENGTH + 0.3,
+        "elongation or\naxial force",
+        color=RED,
+        ha="center",
+        va="center",
+        fontsize=7,
+    )
+    axes.text(
+        0,
+        -0.25,
+        "ends keep their planes;\nfree to move radially",
+        ha="center",
+        va="top",
+        fontsize=7,
+    )
     arrow(axes, (1.35, 0), (1.35, 1.0), lw=1)
     axes.text(1.42, 0.95, "$z$", va="top")
     arrow(axes, (1.35, 0), (1.9, 0), lw=1)
@@ -184,7 +217,14 @@ def draw_angles(axes: Axes) -> None:
     axes.text(0.07, 1.27, "a: 90°", va="center")
     for angle in (30, 60):
         radian = np.radians(angle)
-        axes.text(1.14 * np.cos(radian), 1.14 * np.sin(radian), f"{angle}°", ha="center", va="center", fontsize=7)
+        axes.text(
+            1.14 * np.cos(radian),
+            1.14 * np.sin(radian),
+            f"{angle}°",
+            ha="center",
+            va="center",
+            fontsize=7,
+        )
     for number, angle in enumerate((8.0, 45.0, 82.0)):
         left, colour = 0.62 * number - 0.35, ANGLE_COLOURS[int(angle / 90 * len(ANGLE_COLOURS))]
         axes.add_patch(Rectangle((left, -0.95), 0.55, 0.55, fc=colour, ec="0.4", lw=0.8))
@@ -193,7 +233,14 @@ def draw_angles(axes: Axes) -> None:
             arm = 0.2 * np.array([np.cos(np.radians(angle)), sign * np.sin(np.radians(angle))])
             axes.plot(*np.array([middle - arm, middle + arm]).T, color="black", lw=1.6)
         axes.text(middle[0], -1.0, f"{angle:.0f}°", ha="center", va="top", fontsize=7.5)
-    axes.text(0.55, -1.2, "pieces of the wall with the\nfour chains of their cell", ha="center", va="top", fontsize=7)
+    axes.text(
+        0.55,
+        -1.2,
+        "pieces of the wall with the\nfour chains of their cell",
+        ha="center",
+        va="top",
+        fontsize=7,
+    )
     axes.set(xlim=(-0.45, 1.65), ylim=(-1.65, 1.5))
 
 
@@ -204,7 +251,11 @@ def tube() -> Figure:
     for axes, letter, title, draw in zip(
         panels,
         "abc",
-        ("along the tube: loads and supports", "across the tube: axes and bands", "fibre angles and colours"),
+        (
+            "along the tube: loads and supports",
+            "across the tube: axes and bands",
+            "fibre angles and colours",
+        ),
         (draw_length, draw_across, draw_angles),
         strict=True,
     ):
@@ -224,10 +275,10 @@ BOXES = {  # name: left, bottom, text, whether it is a command
     "folder": (7.8, 1.15, "history.csv\nfields.vtkhdf", False),
     "data": (0.0, 0.0, "measured curves\n(.csv)", False),
     "fit": (6.1, 0.0, "fit", True),
-    "bands": (7.8, 0.0, "numbers with\nconfidence intervals", False),
+    "bands": (7.8, 0.0, "fitted scene.toml,\n95 % intervals", False),
     "report": (10.0, 2.3, "report", True),
     "page": (11.7, 2.3, "report.html\n(any browser)", False),
-    "picture": (10.0, 1.15, "picture, animate", True),
+    "picture": (10.0, 1.15, "picture,\nanimate", True),
     "images": (11.7, 1.15, ".png, .pdf\n.webp, .gif", False),
     "export": (10.0, 0.0, "export", True),
     "fibres": (11.7, 0.0, "fibres for FEBio,\nAbaqus, ParaView", False),
@@ -260,11 +311,16 @@ def workflow() -> Figure:
     for x, y, text, command in BOXES.values():
         looks = {"fc": BLUE, "ec": BLUE} if command else {"fc": "white", "ec": "0.3"}
         width = NARROW if command else WIDE
-        axes.add_patch(FancyBboxPatch((x, y), width, HIGH, boxstyle="round,pad=0,rounding_size=0.12", lw=0.9, **looks))
+        axes.add_patch(
+            FancyBboxPatch(
+                (x, y), width, HIGH, boxstyle="round,pad=0,rounding_size=0.12", lw=0.9, **looks
+            )
+        )
         axes.text(x + width / 2, y + HIGH / 2, text, ha="center", va="center", fontsize=6.3,
                   color="white" if command else "black", weight="bold" if command else "normal")  # fmt: skip
     for pair in ARROWS:
         arrow(axes, *ends_of(*pair), lw=0.9, color="0.3")
+    arrow(axes, (8.3, HIGH), (7.1, 1.15), lw=0.9, color="0.3")  # what was fitted is run
     axes.set(xlim=(-0.1, 13.55), ylim=(-0.15, 3.15))
     return figure
 
@@ -272,5 +328,9 @@ def workflow() -> Figure:
 def make(keep: bool) -> None:
     """Draw the three; there is nothing to keep."""
     source = "docs/making/schematics.py"
-    for name, about, draw in (("cell", CELL, cell), ("tube", TUBE, tube), ("workflow", WORKFLOW, workflow)):
+    for name, about, draw in (
+        ("cell", CELL, cell),
+        ("tube", TUBE, tube),
+        ("workflow", WORKFLOW, workflow),
+    ):
         drawn(Page(FIGURES, name, *about), draw, made=source, **{"axes.grid": False})

@@ -177,10 +177,18 @@ def test_the_tube_of_the_readme_is_that_of_its_tutorial_and_so_are_its_numbers()
     """`docs/make tutorials` makes the numbers."""
     readme = (ROOT / "README.md").read_text(encoding="utf-8")
     ((_, scene),) = (block for block in BLOCK.findall(readme) if block[0] == "toml")
-    (tutorial,) = (text for kind, text in BLOCK.findall((ROOT / f"docs/{TUBE}.md").read_text()) if kind == "toml")
+    (tutorial,) = (
+        text
+        for kind, text in BLOCK.findall((ROOT / f"docs/{TUBE}.md").read_text())
+        if kind == "toml"
+    )
     assert tomllib.loads(scene) | {"name": "tube"} == tomllib.loads(tutorial)
-    numbers = re.findall(r"([\d.]+) mm, (?:\w+ )*?(?:from 45 to )?([\d.]+) degrees", readme.replace("\n", " "))
-    printed = dict(re.findall(r"-> ([\d.]+) mm, ([\d.]+) degrees", (ROOT / f"docs/{TUBE}.md").read_text()))
+    numbers = re.findall(
+        r"([\d.]+) mm, (?:\w+ )*?(?:from 45 to )?([\d.]+) degrees", readme.replace("\n", " ")
+    )
+    printed = dict(
+        re.findall(r"-> ([\d.]+) mm, ([\d.]+) degrees", (ROOT / f"docs/{TUBE}.md").read_text())
+    )
     assert dict(numbers) == printed and len(printed) == 2
 
 
