@@ -221,17 +221,10 @@ def of_readme() -> None:
     """Keep the animation of the artery, an example of a report, and a picture of it."""
     animation = FIGURES / "artery.webp"
     animation.unlink(missing_ok=True)
-    obey("remodel-fenicsx", "animate", "artery", "--cut", "half", "--view", "above", "--frames", "30", "-o",
+    obey("remodel-fenicsx", "animate", "artery", "--cut", "half", "--view=0.35,-1,0.42",
+        "--frames",
+        "24", "-o",
          str(animation))  # fmt: skip
-    with Image.open(animation) as moving:
-        frames, durations = [], []
-        for number in range(moving.n_frames):
-            moving.seek(number)
-            frames.append(moving.convert("RGB").resize((480, 480 * moving.height // moving.width)))
-            durations.append(moving.info["duration"])
-    frames[0].save(
-        animation, save_all=True, append_images=frames[1:], duration=durations, loop=0, quality=70
-    )
     shutil.copyfile(WORK / "tube" / "report.html", REPORT)
     if browser_path() is None:
         print("no browser: docs/figures/report.png stays as it is")
