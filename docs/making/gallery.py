@@ -221,10 +221,8 @@ def of_readme() -> None:
     """Keep the animation of the artery, an example of a report, and a picture of it."""
     animation = FIGURES / "artery.webp"
     animation.unlink(missing_ok=True)
-    obey("remodel-fenicsx", "animate", "artery", "--cut", "half", "--view=0.35,-1,0.42",
-        "--frames",
-        "24", "-o",
-         str(animation))  # fmt: skip
+    view = ("--cut", "half", "--view=0.35,-1,0.42")
+    obey("remodel-fenicsx", "animate", "artery", *view, "--frames", "24", "-o", str(animation))
     shutil.copyfile(WORK / "tube" / "report.html", REPORT)
     if browser_path() is None:
         print("no browser: docs/figures/report.png stays as it is")
