@@ -348,13 +348,18 @@ def show(axes: Axes, image: np.ndarray, below: str = "") -> None:
 
 
 def tubes(
-    figure: Figure, grids: Sequence[Any], shown: Sequence[Shown], below: Sequence[str]
+    figure: Figure,
+    grids: Sequence[Any],
+    shown: Sequence[Shown],
+    below: Sequence[str],
+    bottom: float = 0.215,
+    height: float = 0.72,
 ) -> list[Axes]:
-    """Five tubes beside each other, on one scale."""
+    """Draw five tubes next to each other, on one scale."""
     tallest = max(top(grid) for grid in grids)
     panels = []
     for number, image in enumerate(drawn(shown, ABOVE, tallest / 2, 1.25 * tallest, (360, 560))):
-        panels.append(figure.add_axes((0.005 + 0.198 * number, 0.215, 0.198, 0.72)))
+        panels.append(figure.add_axes((0.005 + 0.198 * number, bottom, 0.198, height)))
         show(panels[-1], image, below[number])
     return panels
 
@@ -558,22 +563,22 @@ AT_END = IN_WALL.format(" at $t$ = 150")
 
 
 def draw_artery(runs: Runs, page: Page) -> None:
-    """Fig. 7: the artery at five times."""
+    """Draw Fig. 7: the artery at five times, from outside, and the half behind its axis."""
     run = runs["artery"]
     grids = [run.grid(time) for time in ARTERY_TIMES]
     loads = [
         (run.value("axial_elongation", time), run.value("pressure", time)) for time in ARTERY_TIMES
     ]
-    figure = Figure(figsize=(8.2, 3.5))
+    figure = Figure(figsize=(8.2, 5.9))
+    behind = grids[0].cell_centers().points[:, 1] > 0
+    words = [loads_in_words(*pair) for pair in loads]
     panels = tubes(
-        figure,
-        grids,
-        [Shown(run, time) for time in ARTERY_TIMES],
-        [loads_in_words(*pair) for pair in loads],
+        figure, grids, [Shown(run, time) for time in ARTERY_TIMES], [""] * len(words), 0.545, 0.42
     )
+    tubes(figure, grids, [Shown(run, time, behind) for time in ARTERY_TIMES], words, 0.125, 0.42)
     for axes, time in zip(panels, ARTERY_TIMES, strict=True):
         axes.set_title(f"$t$ = {time:g}")
-    angle_scale(figure, (0.25, 0.125, 0.5, 0.026), IN_WALL.format(""))
+    angle_scale(figure, (0.25, 0.075, 0.5, 0.016), IN_WALL.format(""))
     lettered(panels)
     page.save(figure)
     names = (
@@ -716,13 +721,14 @@ def draw_rate(runs: Runs, page: Page) -> None:
                 dashes,
                 color=colour,
                 lw=1.4,
-                label=f"{label[law]}, {place}",
             )
+            if law == "explicit":
+                over_time.plot([], [], dashes, color="0.3", lw=1.4, label=f"{place} elements")
     over_time.set(
         xlabel="time", ylabel="reference fibre angle (degrees)", xlim=(0, 150), ylim=(-2, 92)
     )
     over_time.set_yticks(range(0, 91, 15))
-    over_time.legend(loc="upper left", ncols=2)
+    over_time.legend(loc="upper left")
     profiles(over_radius, {label[law]: table for law, table in tables.items()})
     over_radius.legend(loc="upper left")
     lettered([over_time, over_radius])

@@ -224,7 +224,12 @@ def _drawn(
         plotter.camera.zoom(ZOOM)
     plotter.subplot(rows, 0)
     plotter.view_vector(job.direction, up)
-    look = {"n_labels": 7, "fmt": "%.3g", "color": "black", "label_font_size": LETTER}
+    look = {
+        "n_labels": 7,
+        "fmt": "%.0f°" if job.field == ANGLE else "%.3g",
+        "color": "black",
+        "label_font_size": LETTER,
+    }
     plotter.add_scalar_bar(
         job.scale,
         mapper=actor.mapper,
@@ -369,7 +374,7 @@ def _draw(
         for times in sheets
     ]
     label, (along, across) = "angle of the collagen", scene.geometry.angle_in_words
-    scale, limits = f"{label}, deformed: 0 {along}, 90 {across} (degrees)", [0.0, 90.0]
+    scale, limits = f"deformed fibre angle: 0° {along}, 90° {across}", [0.0, 90.0]
     if field != ANGLE:
         values = [body.cell_data[field] for sheet in drawn for _, body in sheet]
         label, limits = words(field), [np.min(values), np.max(values)]

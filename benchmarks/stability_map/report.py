@@ -66,8 +66,8 @@ def listed(
 
 # ---------------------------------------------------------------- the picture
 COLOURS = {
-    "right": "#3a923a", "refused": "#9ecae1", "unstable": "#3182bd", "warned": "#f0c808", "wrong": "#c1272d",
-    "unchecked": "#8c6bb1", "not run": "#ffffff",
+    "right": "#cfe1f2", "refused": "#6f6f6f", "unstable": "#2b6cb0", "warned": "#f0a202", "wrong": "#000000",
+    "unchecked": "#b3b3b3", "not run": "#ffffff",
 }  # fmt: skip
 WIDTH = 60  # squares in a row
 

@@ -12,6 +12,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
+from matplotlib.patches import Rectangle
 
 from docs.making.pages import FIGURES, Columns, by_column, drawn, panel_letters, read_table
 from remodel_fenicsx import Scene, Simulation
@@ -22,7 +23,12 @@ from remodel_fenicsx.solver.continuation import StepFailure
 from remodel_fenicsx.studies.study import COLOURS, Page
 from tests.runs import made
 
+NO_ANGLE = {"rests": "no cut", "rests slowly": "no cut*"}  # whose cut was not solved
 OPENING_ANGLES = (0, 60, 120, 160)  # degrees
+LOOKS = [
+    {"color": colour, "linestyle": line}
+    for colour, line in zip(COLOURS, ("-", "--", "-.", ":"), strict=False)
+]
 RESIDUAL = (
     "Residual stress and the fibre angle of the paper's artery",
     "a: hoop stress without load, before any remodeling; b: under the paper's loads at t = 150; c: fibre angle at "
@@ -80,25 +86,28 @@ def residual(opening_angle: float) -> Columns:
 
 def draw_walls(table: Columns) -> Figure:
     """Three panels over the radius, a curve for each opening angle."""
-    figure = Figure(figsize=(7.2, 2.7), layout="constrained")
+    figure = Figure(figsize=(7.2, 3.0), layout="constrained")
     panels = figure.subplots(1, 3)
     labels = {
-        "unloaded": "hoop stress, t = 0",
-        "loaded": "hoop stress, t = 150",
-        "angle": "fibre angle, degrees",
+        "unloaded": "hoop stress at t = 0, unit of μ",
+        "loaded": "hoop stress at t = 150, unit of μ",
+        "angle": "fibre angle at t = 150, degrees",
     }
     for letter, axes, (name, label) in zip("abc", panels, labels.items(), strict=True):
         axes.set_title(letter, loc="left", fontweight="bold")
-        for colour, opening_angle in zip(COLOURS, OPENING_ANGLES, strict=False):
+        for look, opening_angle in zip(LOOKS, OPENING_ANGLES, strict=True):
             axes.plot(
                 table["radius"],
                 table[f"{name}_{opening_angle}"],
-                color=colour,
+                **look,
                 label=f"{opening_angle}°",
             )
-        axes.set(xlabel="radius without load", ylabel=label)
+        axes.set(xlabel="unloaded radius (lumen: 1)", ylabel=label, xlim=(1, 3))
     panels[1].set_yscale("log")
-    panels[2].set_ylim(0, 90)
+    panels[1].set_yticks((1, 3, 10, 30))
+    panels[1].minorticks_off()
+    panels[1].yaxis.set_major_formatter("{x:g}")
+    panels[2].set(ylim=(0, 90), yticks=range(0, 91, 15))
     panels[0].legend(title="opening angle", fontsize=7)
     return figure
 
@@ -114,9 +123,9 @@ class Wall(NamedTuple):
 WALLS = {"thin": Wall(1.3, 1.2), "thick": Wall(3.0, 4.8)}
 MAP = (
     "Where turnover comes to rest",
-    "By gain and deposition stretch: opening angle at rest in degrees, below 0 where a cut ring would overlap; an "
-    "asterisk where it rests after 40 T only; 'slower' where the wall still dilates at 60 T, ever more slowly, "
-    "'faster' where it dilates faster and faster. Law tensor, T = 40, chosen steps (tolerance 1), isotropic cells at "
+    "By gain and deposition stretch: opening angle in equilibrium in degrees, below 0 if a cut ring would overlap; an "
+    "asterisk: equilibrium after 40 T only; 'slower': the wall still dilates at 60 T, ever more slowly; 'faster' "
+    "(hatched): it dilates faster and faster; 'no cut': equilibrium, but the cut ring was not solved. Law tensor, T = 40, adaptive steps (tolerance 1), isotropic cells at "
     "t = 0, one radius, elongation 10 %.",
 )
 
@@ -191,7 +200,8 @@ def draw_map(table: Columns) -> Figure:
         axes.set(title=f"wall of 1 to {wall.outer_radius:g}, pressure {wall.pressure:g}")
         axes.set_xlabel("deposition stretch")
     panels[0].set_ylabel("gain")
-    figure.colorbar(image, ax=panels, label="opening angle at rest, degrees", extend="min")
+    label = "opening angle in equilibrium, degrees"
+    figure.colorbar(image, ax=panels, label=label, extend="min")
     panel_letters(*panels)
     return figure
 
@@ -200,11 +210,15 @@ def _map(axes: Axes, table: dict[str, Any]) -> Any:
     shape = len(STRETCHES), len(GAINS)
     angles, outcomes = table["opening_angle"].reshape(shape), table["outcome"].reshape(shape)
     image = axes.imshow(
-        angles.T, origin="lower", aspect="auto", cmap="viridis", vmin=0.0, vmax=180.0
+        angles.T, origin="lower", aspect="auto", cmap="cividis", vmin=0.0, vmax=180.0
     )
     for i, j in np.ndindex(shape):
         if np.isnan(angles[i, j]):
-            text, colour = outcomes[i, j], {"slower": "0.35", "faster": COLOURS[1]}[outcomes[i, j]]
+            text, colour = NO_ANGLE.get(outcomes[i, j], outcomes[i, j]), "0.2"
+            if text == "faster":
+                axes.add_patch(
+                    Rectangle((i - 0.5, j - 0.5), 1, 1, fc="0.88", ec="0.65", lw=0, hatch="///")
+                )
         else:
             text = f"{angles[i, j]:.0f}" + ("*" if outcomes[i, j] == "rests slowly" else "")
             colour = "white" if angles[i, j] < 110 else "black"

@@ -353,7 +353,7 @@ def tissue() -> Row:
                 scene.with_values({"cells.initial": cells}), data, folder, starts=1, profiles=False
             )
         if found.misfit < best["misfit"]:
-            (table,), (model,) = found.tables, found.modelled
+            (table,), (model,) = found.problem.tables, found.modelled
             best = {"misfit": found.misfit, "angle": angle} | dict(
                 zip(found.keys, map(float, found.values), strict=True)
             )
@@ -501,22 +501,17 @@ def draw(found: Columns) -> Figure:
     figure = Figure(figsize=(5.2, 3.2), layout="constrained")
     axes = figure.subplots()
     middle, narrow, wide = measured()
-    axes.axhspan(narrow, wide, color="0.85", label="carotid arteries, measured")
-    axes.axhline(middle, color="0.6")
+    axes.axhspan(narrow, wide, color="0.85", label="measured, one standard deviation")
+    axes.axhline(middle, color="0.5", lw=1, label="measured, mean")
     for number, label in enumerate(WALLS):
-        style = {
-            "color": COLOURS[number // 2],
-            "linestyle": "-" if number % 2 else "--",
-            "marker": "o",
-        }
-        axes.plot(
-            ["inside", "half-way", "outside"],
-            [found[name][number] for name in BANDS],
-            label=label,
-            **style,
-        )
-    axes.set(ylabel="angle to the circumference, degrees", ylim=(0, 90))
-    axes.legend(fontsize=7)
+        places = np.arange(len(BANDS)) + 0.12 * (number - 1.5)
+        face = COLOURS[number // 2] if number % 2 else "white"
+        angles = [found[name][number] for name in BANDS]
+        axes.plot(places, angles, "os^D"[number], mec=COLOURS[number // 2], mfc=face, label=label)
+    axes.set(ylabel="fibre angle to the circumference, degrees", ylim=(-2, 90), xlim=(-0.5, 2.5))
+    axes.set_xticks(range(len(BANDS)), ["inner eighth", "mid-wall", "outer eighth"])
+    axes.grid(axis="x", visible=False)
+    axes.legend(fontsize=7, loc="upper left", title="radii of the wall", alignment="left")
     return figure
 
 

@@ -156,21 +156,40 @@ def test_the_refusal_of_the_first_page_is_the_one_that_is_printed(
 def test_the_examples_of_the_readme_run(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """What stands before "More commands"; tests/house/test_documentation.py reads the rest, which takes minutes."""
+    """With the scene that it shows; tests/house/test_documentation.py runs its Python."""
     monkeypatch.chdir(tmp_path)
-    for _, text in blocks(TUBE):
-        keep(text)
-    text, _ = (ROOT / "README.md").read_text(encoding="utf-8").split("## More commands")
+    text = (ROOT / "README.md").read_text(encoding="utf-8")
     for long, short in OF_PAGES["short_readme"].items():
         assert long in text
         text = text.replace(long, short)
     monkeypatch.setattr("remodel_fenicsx.body.tube.PAPER", (8, 4, 1))
-    lines = [line.partition("    #")[0] for block in re.findall(r"^```sh\n(.*?)^```", text, re.M | re.S)
+    assert [keep(block) for kind, block in BLOCK.findall(text) if kind == "toml"] == [True]
+    lines = [line.partition("    #")[0] for kind, block in BLOCK.findall(text) if kind == "sh"
              for line in block.splitlines() if not is_left_out(line)]  # fmt: skip
-    assert len(lines) == 5
+    tests = lines.pop(1)
+    assert tests.split() == ["./with-fenicsx", "tests/run"] and len(lines) == 4
     for line in lines:
         obey(line, capsys)
-    assert Path("results/artery/report.html").exists() and Path("tube/history.csv").exists()
+    assert Path("results/artery/report.html").exists() and Path("high/report.html").exists()
+
+
+def test_the_tube_of_the_readme_is_that_of_its_tutorial_and_so_are_its_numbers() -> None:
+    """`docs/make tutorials` makes the numbers."""
+    readme = (ROOT / "README.md").read_text(encoding="utf-8")
+    ((_, scene),) = (block for block in BLOCK.findall(readme) if block[0] == "toml")
+    (tutorial,) = (
+        text
+        for kind, text in BLOCK.findall((ROOT / f"docs/{TUBE}.md").read_text())
+        if kind == "toml"
+    )
+    assert tomllib.loads(scene) | {"name": "tube"} == tomllib.loads(tutorial)
+    numbers = re.findall(
+        r"([\d.]+) mm, (?:\w+ )*?(?:from 45 to )?([\d.]+) degrees", readme.replace("\n", " ")
+    )
+    printed = dict(
+        re.findall(r"-> ([\d.]+) mm, ([\d.]+) degrees", (ROOT / f"docs/{TUBE}.md").read_text())
+    )
+    assert dict(numbers) == printed and len(printed) == 2
 
 
 def test_numbers_of_an_experiment_go_into_the_tutorials_scene(

@@ -49,3 +49,20 @@ def test_the_paper_and_its_bibliography_name_the_same_works_and_its_figures_are_
         f"\n# {title}" in text
         for title in ("Summary", "Statement of need", "State of the field", "References")
     )
+
+
+def test_every_decimal_of_the_paper_stands_on_a_page_that_is_made_of_runs() -> None:
+    """The pages are made by `docs/make verification` and `docs/make validation`."""
+    _, _, text = (ROOT / "paper" / "paper.md").read_text(encoding="utf-8").split("---\n", 2)
+    pages = [ROOT / "docs" / f"{name}.md" for name in ("verification", "validation")]
+    known = re.findall(r"\d+\.\d+", " ".join(page.read_text(encoding="utf-8") for page in pages))
+    numbers = set(re.findall(r"\d+\.\d+", text))
+    assert len(numbers) > 10
+    assert not numbers - set(known)
+
+
+def test_the_paper_has_the_sections_and_the_length_that_its_journal_asks_for() -> None:
+    _, _, text = (ROOT / "paper" / "paper.md").read_text(encoding="utf-8").split("---\n", 2)
+    for title in ("Software design", "Research impact statement", "AI usage disclosure"):
+        assert f"\n# {title}\n" in text
+    assert 750 <= len(text.split()) <= 1750
