@@ -395,8 +395,8 @@ def write_wall(
     if (thinner := wall.allowed < asked).any():
         thinnest = int(np.argmin(wall.allowed / asked))
         lines.append(
-            f"thinner than asked at {thinner.sum()} of {len(thinner)} corners, where the wall would "
-            f"fold or meet itself; least {wall.allowed[thinnest]:.3g} for {asked[thinnest]:.3g} at "
+            f"thinner than asked at {thinner.sum()} of {len(thinner)} corners, where the wall "
+            f"would fold or meet itself; least {wall.allowed[thinnest]:.3g} for {asked[thinnest]:.3g} at "
             f"{format_position(divided.points[thinnest])}"
         )
     if wall.straight:

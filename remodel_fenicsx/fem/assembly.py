@@ -179,7 +179,7 @@ def raise_on_all_ranks(comm: MPI.Intracomm, make: Callable[[], T]) -> T:
         made = make()
     except ValueError as error:
         refusal = error
-    refusal = next(filter(None, comm.allgather(refusal)), None)
+    refusal = next(filter(None, allgather(comm, refusal)), None)
     if refusal is not None:
         raise refusal
     return cast(T, made)

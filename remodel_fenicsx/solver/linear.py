@@ -104,7 +104,7 @@ MOST_RENEWALS = 6
 # about as much as 20 iterations.
 KEPT_LEVELS = 20
 # Lambda/mu above which smoothers take two steps of Chebyshev's iteration.
-STIFF_BULK = 50.0
+SECOND_SWEEP = 50.0
 # Operations of a factorisation per entry of the tangent up to which a few factorisations cost less
 # than multigrid: 6,200 in a branching wall of 250,000 unknowns; 10,700 in a stout one of 306,000,
 # where both take about as long.
@@ -395,7 +395,7 @@ class Multigrid(FullNewton):
                 self._solver.getPC(),
                 prolongation_from_degree_one(space),
                 matrix,
-                is_stiff=_bulk_ratio(equilibrium) > STIFF_BULK,
+                is_stiff=_bulk_ratio(equilibrium) > SECOND_SWEEP,
             )
         else:
             matrix.setNearNullSpace(rigid_body_modes(space, matrix))

@@ -29,7 +29,7 @@ from remodel_fenicsx.errors import BAD_ENVIRONMENT, SOLVE_FAILED, RemodelError, 
 from remodel_fenicsx.results.run_folder import chosen_folder
 from remodel_fenicsx.results.recording import RunLock
 from remodel_fenicsx.scene.scene import Scene, SceneError
-from remodel_fenicsx.schema.settings import TURNOVER_POWER, Load
+from remodel_fenicsx.schema.settings import Load
 from remodel_fenicsx.schema.tables import Table, format_value, listed, validation_error
 from remodel_fenicsx.schema.text import read_columns, read_toml
 from remodel_fenicsx.schema.units import (
@@ -80,14 +80,13 @@ Columns = dict[str, Array]
 LARGEST_TABLE = 10**7  # bytes: a hundred thousand rows
 DIMENSIONS = {"stress": STRESS, "length": LENGTH, "stress * length^2": FORCE, "force": FORCE}
 PROTOCOL = "protocol"  # the column of labels of protocols
-NOT_MEASURED = {
-    *(
+NOT_MEASURED = set(
+    (
         "max_chain_extension min_jacobian stored_energy remodeling_power newton_iterations "
         "linear_iterations substeps seconds pass_residual time_error negative_eigenvalues "
-        "inactive_fraction asleep_share cpu_seconds processor_seconds"
-    ).split(),
-    TURNOVER_POWER,
-}
+        "inactive_fraction asleep_share cpu_seconds processor_seconds turnover_power"
+    ).split()
+)
 SCALE = "scale."  # prefix of the keys of factors on columns
 SCALE_BOUNDS = (1e-3, 1e3)  # bounds of factors on columns
 WIDE = 1e3  # default bound over the start
