@@ -216,8 +216,9 @@ def _drawn(
     up = (0, 1, 0) if math.hypot(*job.direction[:2]) < 0.01 * abs(job.direction[2]) else (0, 0, 1)
     for number, (title, body) in enumerate(sheet):
         plotter.subplot(*divmod(number, columns))
-        bare: Any = {"show_scalar_bar": False, "line_width": 0.5, "clim": job.limits}
-        actor = add_body(plotter, body, job.field, **bare)
+        actor = add_body(
+            plotter, body, job.field, show_scalar_bar=False, line_width=0.5, clim=job.limits
+        )
         plotter.add_text(title, "upper_edge", LETTER, "black")
         plotter.enable_parallel_projection()
         plotter.view_vector(job.direction, up, bounds=bounds)

@@ -42,6 +42,7 @@ if TYPE_CHECKING:
     from remodel_fenicsx.body.domain import Domain
     from remodel_fenicsx.body.loading import Loading
     from remodel_fenicsx.fem.quadrature import Quadrature
+    from remodel_fenicsx.results.columns import Measurement
 
 log = logging.getLogger(__name__)
 
@@ -237,16 +238,16 @@ def _of_process(process: str, value: Callable[..., float], m: Any) -> float:
     return float(value(m.observer.stepper.process(process)))
 
 
-def _max_principal_stress(m: Any) -> float:
-    stress = np.linalg.eigvalsh(m.stress)[..., 2]
+def _max_principal_stress(m: Measurement) -> float:
+    stress = np.asarray(np.linalg.eigvalsh(m.stress)[..., 2], float)
     largest, position = m.quadrature.maximum(stress), m.quadrature.shown_place_of_largest(stress)
     if m.domain.comm.rank == 0:
         text = "time %g: largest principal stress %.6g at the reference position %s"
         log.info(text, m.step.time, largest, position)
-    return float(largest)
+    return largest
 
 
-def _percentile_99_stress(m: Any) -> float:
+def _percentile_99_stress(m: Measurement) -> float:
     values = np.linalg.eigvalsh(m.stress)[..., 2], np.linalg.det(m.F) * m.quadrature.volumes
     parts = m.domain.comm.allgather([m.quadrature.owned(one).ravel() for one in values])
     stress, volumes = np.concatenate(parts, axis=1)

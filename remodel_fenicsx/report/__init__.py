@@ -438,9 +438,15 @@ def sectors(run: ReportedRun) -> Card | None:
     """Plot hoop stress through the wall in sectors of a vessel's length."""
     unit = unit_of(run.recording.scene, "stress")
     names, label = [f"{k + 1} of {SECTORS}" for k in range(SECTORS)], f"hoop stress {unit}"
-    legend = "Means of layers in sectors of the length; 1 is at the inlet."
-    title = "Hoop stress by sector"
-    return _by_layer(run, "sectors", names, label, title=title, unit=unit, legend=legend)
+    return _by_layer(
+        run,
+        "sectors",
+        names,
+        label,
+        unit=unit,
+        title="Hoop stress by sector",
+        legend="Means of layers in sectors of the length; 1 is at the inlet.",
+    )
 
 
 def content(run: ReportedRun) -> Card | None:

@@ -11,7 +11,6 @@ from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -54,15 +53,15 @@ def write_vtu(
 # ---------------------------------------------------------------- cells as fibres of other programs
 # The cells of a recorded run as fibres of other programs: one structure tensor for each element.
 # Elements and nodes have the numbers of the run's mesh file, counted from 1 in text. Models of
-# other programs (programs.toml) have regions, faces, supports and pressures too, for which the body is
-# meshed again; other formats need no dolfinx.
+# other programs (programs.toml) have regions, faces, supports and pressures too, for which the
+# body is meshed again; other formats need no dolfinx.
 
 Array = NDArray[np.float64]
 
 TENSOR_COMPONENTS = tuple(f"{i}{j}" for i in "xyz" for j in "xyz")  # of a tensor, row by row
 
 
-PROGRAMS = tomllib.loads(Path(__file__).with_name("programs.toml").read_text(encoding="utf-8"))
+PROGRAMS = tomllib.loads(Path(__file__).with_name("programs.toml").read_text("utf-8"))
 VTK_TYPES = {4: 10, 8: 12, 10: 24, 27: 29}  # by number of nodes
 
 
@@ -198,13 +197,14 @@ def _model(program: str, path: Path, fibres: Fibres, recording: RecordedRun, tim
     from remodel_fenicsx.body.loading import values_of_loads
 
     scene, supports = recording.scene, recording.scene.supports.faces
-    domain: Any = scene.geometry.build_with(scene.regions, scene.mesh, MPI.COMM_SELF)
+    domain = scene.geometry.build_with(scene.regions, scene.mesh, MPI.COMM_SELF)
     if domain.number_of_elements != len(fibres.elements):
         raise RecordingError(f"{recording.path}: the scene's mesh has other elements than the run")
-    region = domain.gather_elements(domain.element_region)
-    texts, elements, axes = PROGRAMS[program], fibres.reduced, fibres.axes
+    region = np.asarray(domain.gather_elements(domain.element_region))
+    texts, elements = PROGRAMS[program], fibres.reduced
     nodes, count = np.unique(elements), str(elements.shape[1])
     kind, sides = PROGRAMS["elements"][count][program], np.array(PROGRAMS["sides"][count])
+    axes = np.moveaxis(fibres.axes, 1, 0)
     parts = defaultdict[str, list[str]](list)
 
     def add(part: str, name: str, **values: object) -> None:
@@ -214,7 +214,7 @@ def _model(program: str, path: Path, fibres: Fibres, recording: RecordedRun, tim
     for name, number in domain.regions.items():
         rows = np.flatnonzero(region == number)
         add("part", name, kind=kind, rows=_rows(texts["element"], rows + 1, elements[rows] + 1))
-        add("local_axes", name, rows=_rows(texts["axes"], rows + 1, axes[rows, 0], axes[rows, 1]))
+        add("local_axes", name, rows=_rows(texts["axes"], rows + 1, *axes[:2, rows]))
         for key, values in fibres.values.items():
             text = _rows(texts["value"], rows + 1, values[rows])
             add("values", name, key=key, kind="mat3" if values.ndim > 1 else "scalar", rows=text)

@@ -168,11 +168,11 @@ class WholeBody:
         return None if displacement is None else displacement[self._used], of_elements
 
     def means(self, values: Sequence[Array], part: Numbers | int = 0, parts: int = 1) -> Array:
-        """Return means by volume in the layers, or in `parts` of each, (layers parts, values)."""
+        """Return volume means of the layers, or of sectors of each, (layers sectors, values)."""
         bins, number = parts * self.layer + part, parts * len(self.depth)
         weighted = [self.volume * one for one in (*values, np.ones_like(self.volume))]
         sums = np.stack([np.bincount(bins, one, number) for one in weighted], axis=1)
-        with np.errstate(invalid="ignore"):  # in parts without an element
+        with np.errstate(invalid="ignore"):  # of sectors without elements
             return sums[:, :-1] / sums[:, -1:]
 
     def by_sector(self, values: Array, station: Array) -> Array:
