@@ -396,8 +396,8 @@ def write_wall(
         thinnest = int(np.argmin(wall.allowed / asked))
         lines.append(
             f"thinner than asked at {thinner.sum()} of {len(thinner)} corners, where the wall "
-            f"would fold or meet itself; least {wall.allowed[thinnest]:.3g} for {asked[thinnest]:.3g} at "
-            f"{format_position(divided.points[thinnest])}"
+            f"would fold or meet itself; least {wall.allowed[thinnest]:.3g} for "
+            f"{asked[thinnest]:.3g} at {format_position(divided.points[thinnest])}"
         )
     if wall.straight:
         lines.append(f"{wall.straight} edges are straight: curved ones would invert elements")
