@@ -48,9 +48,10 @@ MOST_RADII, LEAST_RADII = 3.0, 2e-3
 # Smallest distance of the outer face from the lumen, over the thickness. A closer face lies in
 # another part of the wall.
 MIN_CLEARANCE = 0.5
-# Where a wall folds or meets itself it gets thinner by this factor until it does not, down to
-# LEAST_THINNED of the thickness that was asked for, and around there by a slope.
-THINNING, LEAST_THINNED, SLOPE = 0.9, 0.2, 0.25
+# Where a wall folds or meets itself it gets thinner by this factor until it does not.
+THINNING = 0.9
+LEAST_THINNED = 0.2  # smallest thickness there, relative to the requested one
+SLOPE = 0.25  # of the thickness around these positions
 # Edges of a tetrahedron, in the order of its mid-edge nodes.
 EDGES = ([0, 1], [1, 2], [0, 2], [0, 3], [1, 3], [2, 3])
 
@@ -365,8 +366,8 @@ def write_wall(
     if len(read.triangles) > LARGE_SURFACE:
         announce(f"{surface}: remeshing {len(read.triangles)} triangles takes minutes")
     divided, near = remeshed(read, size)
-    asked = depth[near]
-    wall = extrude_wall(divided, read, asked, shares or {"wall": 1.0}, through)
+    requested = depth[near]
+    wall = extrude_wall(divided, read, requested, shares or {"wall": 1.0}, through)
     if taken := shares.keys() & wall.faces:
         raise SceneError(f"--layers {min(taken)}=...: a face has this name; rename the layer")
     names = list(shares) or ["wall"]
@@ -392,12 +393,12 @@ def write_wall(
         f"faces {', '.join(wall.faces)}; "
         + (f"regions {', '.join(names)}" if shares else "one region"),
     ]
-    if (thinner := wall.allowed < asked).any():
-        thinnest = int(np.argmin(wall.allowed / asked))
+    if (thinner := wall.allowed < requested).any():
+        thinnest = int(np.argmin(wall.allowed / requested))
         lines.append(
-            f"thinner than asked at {thinner.sum()} of {len(thinner)} corners, where the wall "
+            f"thinner than requested at {thinner.sum()} of {len(thinner)} corners, where the wall "
             f"would fold or meet itself; least {wall.allowed[thinnest]:.3g} for "
-            f"{asked[thinnest]:.3g} at {format_position(divided.points[thinnest])}"
+            f"{requested[thinnest]:.3g} at {format_position(divided.points[thinnest])}"
         )
     if wall.straight:
         lines.append(f"{wall.straight} edges are straight: curved ones would invert elements")

@@ -68,18 +68,11 @@ class PointwiseRepulsion:
 
     def update(self, stiffness: bool = False) -> None:
         """Update the stress, and the stiffness on request, if unknowns or cells have changed."""
-
-        def evaluate() -> None:
-            # Both take little longer than the stress alone.
-            both, self._stiffness_follows = stiffness or self._stiffness_follows, False
-            self._evaluate(both)
-            if both:
-                self._stiffnesses(lambda: None)
-
-        self._stresses(evaluate)
+        # Both take little longer than the stress alone.
+        self._stresses(lambda: self._evaluate(stiffness or self._stiffness_follows))
         if stiffness:
             self._stiffnesses(lambda: self._evaluate(stiffness=True))
-            self._stiffness_follows = True
+        self._stiffness_follows = stiffness
 
     def _evaluate(self, stiffness: bool) -> None:
         derivatives = self.tissue.repulsion.derivatives
@@ -95,6 +88,7 @@ class PointwiseRepulsion:
         if second is not None:
             values = self.quadrature.values(self.stiffness, (6, 6))
             values[:] = (-2 * modulus[:, None, None] * second).reshape(*shape, 6, 6)
+            self._stiffnesses(lambda: None)  # is up to date
 
     def energy(self) -> float:
         """Return the repulsion's part of the stored energy, over all ranks. Collective."""

@@ -344,7 +344,7 @@ def test_a_wall_gets_thinner_where_it_would_fold(
     written(file, points, triangles)
     assert wall(file, "--thickness", thickness, "--size", 0.3, "-o", path) == 0
     said = re.search(
-        r"thinner than asked at \d+ of .*; least ([\d.]+) for 0.8 at", capsys.readouterr().out
+        r"thinner than requested at \d+ of .*; least ([\d.]+) for 0.8 at", capsys.readouterr().out
     )
     room = LENGTH / bend - RADIUS
     assert said is not None and 0.5 * room < float(said[1]) < 1.1 * room

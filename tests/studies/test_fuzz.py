@@ -59,6 +59,9 @@ OTHER_WORDS = {
     "material.initial_stiffness",
     "material.locking_stretch",
     "remodeling.half_life",
+    "cells.fraction_x",
+    "cells.fraction_y",
+    "cells.mean_angle",
 }  # a scene has the others
 OWN_REFERENCE = {"material.elastin"}  # held against tests/reference/elastin.py
 
