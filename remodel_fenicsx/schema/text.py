@@ -250,7 +250,9 @@ def read_columns(
     if not len(table):
         raise UnreadableFile(f"has no row of numbers with {chosen}")
     columns = {
-        head[place]: _numbers(table[:, place].tolist(), head[place], mark, head[place] == labels)
+        head[place]: _numbers(
+            [str(cell) for cell in table[:, place]], head[place], mark, head[place] == labels
+        )
         for place in used
     }
     words = [f"{written} between columns", *(["decimal commas"] if mark == "," else [])]

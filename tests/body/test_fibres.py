@@ -257,7 +257,7 @@ def test_a_run_keeps_the_file_and_goes_on_with_it(
     whole = run(one, tmp_path / "whole")
     half = run(one.with_values({"time.end": 1.0}), tmp_path / "half")
     digest = hashlib.sha256((tmp_path / "in" / "measured.vtu").read_bytes()).hexdigest()
-    said = f"cells.fibres: structure_tensor of 32 rows, by number; SHA-256 {digest}"
+    said = f"cells.fibres: structure_tensor read from 32 rows by number; SHA-256 {digest}"
     assert said in (half / "run.log").read_text()
     shutil.rmtree(tmp_path / "in")
     half = Path(shutil.move(half, tmp_path / "moved"))
