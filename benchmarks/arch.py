@@ -51,9 +51,7 @@ def write_lumen(path: Path, size: float = 1.2) -> int:
     for degrees, _ in BRANCHES:
         axis = _direction(degrees)
         surface = surface.clip(axis, origin=(ARCH + UP) * axis, invert=True)
-    # Cutting leaves needles, which Gmsh would keep as faces of their own.
-    surface = surface.triangulate().clean(tolerance=0.15 * size, absolute=True)
-    surface = surface.connectivity("largest").extract_surface().triangulate()
+    surface = surface.triangulate().clean().connectivity("largest").extract_surface().triangulate()
     surface.clear_data()
     surface.save(path)
     return int(surface.n_cells)

@@ -211,7 +211,7 @@ def aorta(size: float, ranks: int) -> None:
         numbers = (*seconds, usage.ru_maxrss / 1e6)
         print(lines([[name, *(f"{number:.3g}" for number in numbers), f"{newton}"]]), flush=True)
         if status:
-            print(f"{name}: exit code {os.waitstatus_to_exitcode(status)}")
+            sys.exit(f"{name}: exit code {os.waitstatus_to_exitcode(status)}")
 
 
 def main() -> None:
