@@ -207,9 +207,7 @@ def extrude_wall(
     normals = _smoothed_normals(surface, openings, levels, thickness, tetrahedra)
     allowed = thickness
     while True:
-        points = (surface.points + levels[:, None, None] * allowed[:, None] * normals).reshape(
-            -1, 3
-        )
+        points = _extruded(surface, levels, allowed, normals)
         faulty = _crossed(surface.points, points[-size:], allowed)
         faulty[tetrahedra[_folded(points, tetrahedra)] % size] = True
         if not faulty.any():
@@ -286,14 +284,19 @@ def _smoothed_normals(
     normals = best = _normals(surface, openings)
     fewest = len(tetrahedra)
     for _ in range(SMOOTHINGS):
-        points = surface.points + levels[:, None, None] * thickness[:, None] * normals
-        folds = int(_folded(points.reshape(-1, 3), tetrahedra).sum())
+        points = _extruded(surface, levels, thickness, normals)
+        folds = int(_folded(points, tetrahedra).sum())
         if folds < fewest:
             best, fewest = normals, folds
         if not folds:
             break
         normals = _around(surface, normals[surface.triangles].sum(axis=1), openings)
     return best
+
+
+def _extruded(surface: Surface, levels: Array, thickness: Array, normals: Array) -> Array:
+    """Return the corners of the wall, level by level, (levels points, 3)."""
+    return (surface.points + levels[:, None, None] * thickness[:, None] * normals).reshape(-1, 3)
 
 
 def _folded(points: Array, tetrahedra: Integers) -> Flags:

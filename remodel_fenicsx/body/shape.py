@@ -238,8 +238,14 @@ def _of_process(process: str, value: Callable[..., float], m: Any) -> float:
     return float(value(m.observer.stepper.process(process)))
 
 
+def _largest_principal_stress(m: Measurement) -> Array:
+    return m.cached_for_step(
+        "principal", lambda: np.asarray(np.linalg.eigvalsh(m.stress)[..., 2], float)
+    )
+
+
 def _max_principal_stress(m: Measurement) -> float:
-    stress = np.asarray(np.linalg.eigvalsh(m.stress)[..., 2], float)
+    stress = _largest_principal_stress(m)
     largest, position = m.quadrature.maximum(stress), m.quadrature.shown_place_of_largest(stress)
     if m.domain.comm.rank == 0:
         text = "time %g: largest principal stress %.6g at the reference position %s"
@@ -248,7 +254,7 @@ def _max_principal_stress(m: Measurement) -> float:
 
 
 def _percentile_99_stress(m: Measurement) -> float:
-    values = np.linalg.eigvalsh(m.stress)[..., 2], np.linalg.det(m.F) * m.quadrature.volumes
+    values = _largest_principal_stress(m), np.linalg.det(m.F) * m.quadrature.volumes
     parts = m.domain.comm.allgather([m.quadrature.owned(one).ravel() for one in values])
     stress, volumes = np.concatenate(parts, axis=1)
     return float(np.quantile(stress, 0.99, weights=volumes, method="inverted_cdf"))

@@ -368,9 +368,9 @@ def takes_levels(equilibrium: Equilibrium, options: ProblemOptions) -> bool:
 
 def _bulk_ratio(equilibrium: Equilibrium) -> float:
     """Return the largest lambda/mu. Collective."""
-    parameters = equilibrium.state.parameters(equilibrium.tissue).at_points()
-    ratio = np.max(parameters.lame_lambda / parameters.lame_mu, initial=0.0)
-    return float(allreduce(equilibrium.comm, ratio, MPI.MAX))
+    parameters, quadrature = equilibrium.parameters.at_points(), equilibrium.quadrature
+    ratios = parameters.lame_lambda / parameters.lame_mu
+    return quadrature.maximum(ratios.reshape(quadrature.shape))
 
 
 class Multigrid(FullNewton):
