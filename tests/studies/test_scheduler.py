@@ -34,6 +34,18 @@ def run(scene, *others, whole=running.run, **options):
 
 running.run = run
 """
+KILLED_ONCE = """import os, time
+from remodel_fenicsx.results import checkpoint
+
+def write_checkpoint(folder, *contents, whole=checkpoint.write_checkpoint):
+    whole(folder, *contents)
+    if folder.name.endswith("-5") and not (folder / "killed").exists():
+        (folder / "killed").touch()
+        os.kill(os.getppid(), 9)
+        time.sleep(9)
+
+checkpoint.write_checkpoint = write_checkpoint
+"""
 
 
 def sweep(folder: Path, *words: str, seconds: float = 30.0) -> subprocess.Popen[str]:
@@ -148,14 +160,15 @@ def test_members_of_a_killed_worker_go_on_elsewhere(
     engine: Engine, whole: dict[str, dict[str, list[float]]]
 ) -> None:
     """All are whole, and no process of Dask has loaded MPI or PETSc."""
-    study = engine.study("-o", "out", "-q")
-    engine.wait_for_steps(study)
-    dask = [worker.pid for worker in engine.workers] + [engine.scheduler.pid]
+    (engine.folder / "once.py").write_text(KILLED_ONCE)
+    words = "--with once.py --set output.checkpoint=20 -o out -q".split()
+    assert ended(engine.study(*words)) == (0, [])
+    dask = [p.pid for p in (*engine.workers, engine.scheduler) if p.poll() is None]
+    assert len(dask) == 2
     assert not [n for n in dask if "libmpi" in Path(f"/proc/{n}/maps").read_text()]
-    engine.workers[0].kill()
-    assert ended(study) == (0, [])
-    logs = [path.read_text() for path in (engine.folder / "out").glob("*/run.log")]
-    assert len(logs) == 12 and any("resumes from the checkpoint" in log for log in logs)
+    logs = {path.parent.name: path.read_text() for path in (engine.folder / "out").glob("*/run.log")}
+    resumed = [name for name, log in logs.items() if "resumes from the checkpoint" in log]
+    assert len(logs) == 12 and resumed == ["loads.force.value-5"]
     assert numbers(engine.folder / "out") == whole and not engine.at_work()
 
 
