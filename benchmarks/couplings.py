@@ -4,7 +4,7 @@
     ./with-fenicsx benchmarks/couplings.py              # minutes on an idle core
     ./with-fenicsx benchmarks/couplings.py --page       # only the page, from what has been measured
 
-Table and picture of docs/laws_and_couplings.md.
+Table and picture of docs/time_integration.md.
 
 Error: one layer of the artery's elements along z to t = 40, with steps from 5 to 5/8; each law against its own limit.
 """
@@ -36,7 +36,7 @@ from remodel_fenicsx.body.tube import Tube, whole_tube
 from remodel_fenicsx.studies.study import COLOURS, STYLE, Page
 from tests.runs import made
 
-PAGE = DOCS / "laws_and_couplings.md"
+PAGE = DOCS / "time_integration.md"
 ARTERY = Path(__file__).parents[1] / "demos" / "artery.toml"
 STEPS = (5.0, 2.5, 1.25, 0.625)
 TUBE = Tube(inner_radius=1.0, outer_radius=3.0, length=0.5)
@@ -111,7 +111,7 @@ def errors() -> Iterator[dict[str, Any]]:
         for name, scheme in SCHEMES.items():
             printed_random = cells == "random" and scheme.values is PRINTED
             if printed_random and name != "printed-staggered":
-                continue  # no limit (docs/laws_and_couplings.md)
+                continue  # no limit (docs/time_integration.md)
             key = cells, str(scheme.values)
             if key not in limits:
                 coupling, order = scheme.limit
@@ -176,7 +176,7 @@ def rows_of(table: Columns) -> Iterator[list[str]]:
 
 
 def page() -> str:
-    """docs/laws_and_couplings.md with its table made anew."""
+    """docs/time_integration.md with its table made anew."""
     head = ["law, coupling", "cells", "error of A", "of u", "order in A", "in u", "seconds"]
     errors_table = markdown(head, rows_of(read_table(FIGURES / "couplings.csv")))
     return between_marks(PAGE.read_text(encoding="utf-8"), "errors of couplings", errors_table)

@@ -98,7 +98,7 @@ def scenes() -> dict[str, Scene]:
     for elongation, pressure in LOAD_CASES:
         loads = {"loads.elongation.value": elongation, "loads.pressure.value": pressure}
         found.setdefault(case_name(elongation, pressure), artery.with_values(loads | last_only))
-    for driver in ("pk2", "finger"):  # with these the printed pass over-corrects (docs/theory.md)
+    for driver in ("pk2", "finger"):  # with these the printed pass over-corrects (docs/solver.md)
         method = {
             "remodeling.driver": driver,
             "remodeling.frame": "material",
@@ -789,7 +789,7 @@ WALL = "coloured by the deformed angle of the chains in the wall"
 PROFILE = "Reference fibre angle over the radius at t = 150; lines: means of the element layers, bands: all elements"
 RELAXED = (
     "The printed pass over-corrects with {}: here it is relaxed by one half, in the material frame "
-    "(docs/theory.md, Stability of the pass)."
+    "(docs/solver.md, Stability of the pass)."
 )
 
 

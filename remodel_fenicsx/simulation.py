@@ -122,7 +122,7 @@ class Simulation:
 
         The row and the fields belong to the solved state. With the couplings "staggered" and
         "relaxed", the cells have already made the next remodeling pass when a step is yielded
-        (docs/theory.md, Couplings).
+        (docs/time_integration.md, Couplings).
 
         Parameters
         ----------

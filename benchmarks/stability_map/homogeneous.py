@@ -475,7 +475,7 @@ def check_small_steps(case: Case, run: Run) -> Finding:
     rate = r["kappa"] * scene["time"]["step"]
     forces = nominal_stress(scene, coarse)[:, 2]
     # C drives from the first strain on: its direction jumps where the load comes. And where a force passes through zero
-    # inside a step, the rest of this step is all that has tension (docs/theory.md)
+    # inside a step, the rest of this step is all that has tension (docs/time_integration.md)
     within = bool((forces[:-1] * forces[1:] < 0).any())
     first = r["driver"] == "finger" or within
     error = max(LEAST_ERROR, FIRST_ORDER * rate if first else SECOND_ORDER * rate**2)

@@ -1,4 +1,4 @@
-"""The laws beside each other, for docs/laws_and_couplings.md: three bodies, seven laws, coarse meshes.
+"""The laws beside each other, for docs/time_integration.md: three bodies, seven laws, coarse meshes.
 
 The histories stay in docs/figures/laws.csv; table and picture are made from it alone, so that a test can do the same
 without a run.
@@ -35,7 +35,7 @@ from remodel_fenicsx.solver.continuation import StepFailure
 from remodel_fenicsx.studies.study import COLOURS, Page
 from tests.runs import made
 
-PAGE = DOCS / "laws_and_couplings.md"
+PAGE = DOCS / "time_integration.md"
 CAPTION = (
     "The laws beside each other",
     "a: mean angle to z of a cube pulled along x, from t = 50 to 60 more and more along z instead; b: largest change "

@@ -2,7 +2,7 @@
 
 Isotropic cells with cylindrical axes, one layer of elements along z, else the preset. The reference cannot twist, swirl
 or turn its cells out of the directions circumferential, axial, radial; finite elements can, and do where the remodeling
-pass amplifies a small tilt of the axes (docs/theory.md, Stability of the pass):
+pass amplifies a small tilt of the axes (docs/solver.md, Stability of the pass):
 
 - driver `cauchy`, law `explicit`: never; these runs have the scene's own supports;
 - drivers `pk2` and `finger`: the pass over-corrects. A swirl (pk2) or a twist (finger, frame `spatial`) changes its

@@ -281,7 +281,7 @@ def describe_choice(scene: ReducedScene) -> list[str]:
     if KINEMATICS[made.name].reduced and (swinging := _leaves_symmetry(scene)):
         lines.append(
             f"{made.name!r} is the symmetric solution; with {swinging} the full body leaves it "
-            "after a while, because the pass overshoots (docs/theory.md, Stability of the pass)"
+            "after a while, because the pass overshoots (docs/solver.md, Stability of the pass)"
         )
     cannot = ", which this one cannot show" if KINEMATICS[made.name].reduced else ""
     return [

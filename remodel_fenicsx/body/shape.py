@@ -220,7 +220,7 @@ COLUMNS: dict[str, Column] = {
         Column(
             "remodeling_power",
             "stress length^3 / time",
-            "energy per time that the pass of this step releases (docs/theory.md, "
+            "energy per time that the pass of this step releases (docs/model.md, "
             "Power of remodeling)",
             lambda m: m.step.remodeling_power,
             after_pass=True,
@@ -286,8 +286,8 @@ COLUMNS_ON_REQUEST: dict[str, Column] = {
         Column(
             "time_error",
             "degrees",
-            "estimated time discretisation error (docs/theory.md, Error-controlled steps); "
-            "always present with `time.tolerance`",
+            "estimated time discretisation error (docs/time_integration.md, Error-controlled "
+            "steps); always present with `time.tolerance`",
             lambda m: m.step.time_error,
             after_pass=True,
         ),

@@ -150,8 +150,8 @@ def mirrored_draws(scene: ReducedScene) -> str | None:
         return None
     return (
         "random cells are drawn for a quarter and mirrored to the other three: means over seeds "
-        "are nearly those of the whole tube (docs/kinematics.md), a single draw scatters about "
-        "twice as much"
+        "are nearly those of the whole tube (docs/model.md, Kinematics), a single draw "
+        "scatters about twice as much"
     )
 
 

@@ -229,7 +229,7 @@ class Staggered:
     """Paper's coupling: equilibrium with the previous cells, then one remodeling pass.
 
     If Newton's method does not converge in one increment, the change of the cells and then the
-    change of the loads are applied in substeps (docs/theory.md, "Steps that are too large").
+    change of the loads are applied in substeps (docs/solver.md, "Substeps").
 
     Parameters
     ----------
@@ -480,7 +480,7 @@ class Extrapolated(Staggered):
     """Second-order coupling: remodel with an extrapolated target, then solve."""
 
     # The target sE (switch s, direction E) is extrapolated from the last two steps to the middle of
-    # the step of size h, sE + h/2 d(sE)/dt. See docs/theory.md, Extrapolated coupling.
+    # the step of size h, sE + h/2 d(sE)/dt. See docs/time_integration.md, Extrapolated coupling.
 
     traits = Traits(order=2, accumulates=True, max_scaled_step=0.5)
 

@@ -47,7 +47,7 @@ AllValues = Sequence[Values]  # values of all remodeling processes, in order
 class TimeError:
     """Error estimator, which compares each row with a higher-order one of the coupling."""
 
-    # See docs/theory.md, Error-controlled steps.
+    # See docs/time_integration.md, Error-controlled steps.
 
     def __init__(self, stepper: Stepper):
         self.stepper, self.state = stepper, stepper.state

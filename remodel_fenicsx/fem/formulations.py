@@ -1,7 +1,7 @@
 """Formulations: the points at which elements take J, which decide whether they lock."""
 
 # An element of low degree cannot keep J = 1 at all of its points and bend. It hardly deforms if
-# lambda is much larger than every stiffness against shear (docs/theory.md, Volumetric locking).
+# lambda is much larger than every stiffness against shear (docs/solver.md, Volumetric locking).
 # dolfinx is imported when needed: scenes, which name formulations, are read without it.
 
 from __future__ import annotations

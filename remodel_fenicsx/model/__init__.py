@@ -16,6 +16,6 @@ Remark 6  power of remodeling                                    `energy`: `Tiss
 ========= ====================================================== ============================
 
 Errors of the printed equations are corrected where the equations stand, under the numbers of
-docs/theory.md ("erratum 1"). The law for the structure tensor (`tensor_law`) is not in the paper.
+docs/model.md ("erratum 1"). The law for the structure tensor (`tensor_law`) is not in the paper.
 Tools: `tensors` (one name on arrays and in UFL).
 """

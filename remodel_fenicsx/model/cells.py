@@ -105,8 +105,8 @@ def angle_to_axis(dimensions: Array, axes: Array, direction: Array) -> Array:
     """Return the angle in degrees between the chain direction and a unit vector.
 
     cos^2 = d . A d / tr A with the structure tensor A. If d is one of the axes, it is the angle of
-    sum_I l_I n_I (docs/theory.md, Angles). The component across d is summed separately, so that
-    small angles keep their digits.
+    sum_I l_I n_I (docs/model.md, Fibre angles). The component across d is summed separately, so
+    that small angles keep their digits.
 
     Parameters
     ----------

@@ -1,7 +1,7 @@
 """Strain energy of tissue with remodeling collagen, in UFL or on arrays; it is written only here.
 
 Stresses, drivers, residual and tangent follow by differentiation. Per reference volume
-(docs/theory.md, Energy):
+(docs/model.md, Energy):
 
     W      = W_iso + W_chn + W_rep
     W_iso  = lambda/2 ln^2 J + mu/2 (tr C - 3) - mu ln J
@@ -180,8 +180,9 @@ F = I. Formulations other than "displacement" require a `Matrix`."""
 # The repulsion makes the unloaded tissue stress-free. M has several forms. `axes` is the paper's
 # (eq. 4c) and depends on the axes of a cell. `log` depends only on the structure tensor A = sum_I
 # l_I^2 n_I (x) n_I. It equals `axes` if C and the cell are coaxial, is isotropic for isotropic
-# cells in every frame, and leaves C = I stress-free for every A (docs/theory.md, "The consistent
-# variant"). `length` is the simplest function of A; isotropic cells give it no shear stiffness.
+# cells in every frame, and leaves C = I stress-free for every A (docs/model.md, "Repulsions of the
+# structure tensor"). `length` is the simplest function of A; isotropic cells give it no shear
+# stiffness.
 
 
 def squared_end_to_end_length(

@@ -433,7 +433,7 @@ def follow_tensor(
 
 
 def tensor(cells: UnitCell, drive: Drive, time_old: float, time_new: float) -> UnitCell:
-    """Integrate dA/dt = kappa s (r0^2 E - A) over a step, E and s frozen (docs/theory.md, Law)."""
+    """Integrate dA/dt = kappa s (r0^2 E - A) over a step with E and s frozen."""
     return follow_tensor(
         cells, tensor_target(drive), drive.end_to_end_length, drive.kappa * (time_new - time_old)
     )

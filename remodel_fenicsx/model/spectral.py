@@ -2,7 +2,7 @@
 
 LAPACK's eigenvectors are arbitrary in sign and inside the eigenspace of a repeated value, so that
 they differ between machines and between numbers of ranks. The axes enter the stress (erratum 6 of
-docs/theory.md). Therefore the previous axes decide whatever the tensor leaves undetermined.
+docs/model.md). Therefore the previous axes decide whatever the tensor leaves undetermined.
 """
 
 from itertools import permutations

@@ -1,7 +1,7 @@
 """Tables of a scene, one class each: keys with defaults, units, limits and meanings.
 
 Source of the defaults of tissue and cells: E. Kuhl, G. A. Holzapfel, J. Mater. Sci. 42 (2007)
-8811-8823; docs/theory.md has the equations as implemented. A `Scene` (`scene.scene`) consists of
+8811-8823; docs/model.md has the equations as implemented. A `Scene` (`scene.scene`) consists of
 these tables.
 """
 
@@ -136,7 +136,7 @@ class Model(Table):
     kinematics: Annotated[str, OneOf(KINEMATICS, (AUTO,))] = Field(
         default=AUTO,
         description="'auto' takes the cheapest one that is exact for the scene. "
-        f"{meanings(KINEMATICS)} (docs/kinematics.md).",
+        f"{meanings(KINEMATICS)} (docs/model.md, Kinematics).",
     )
 
 
@@ -232,7 +232,7 @@ class Material(Table):
     ...     lame_lambda=27.293, lame_mu=3.103, chain_density=7e21, contour_length=2.125,
     ...     persistence_length=1.82, temperature=310.0,
     ... )
-    >>> round(material.network_modulus, 3)  # c of docs/theory.md
+    >>> round(material.network_modulus, 3)  # c of docs/model.md
     4.116
     >>> tissue = material.tissue(end_to_end_length=1.0)
     >>> tissue.contour_length
@@ -757,7 +757,7 @@ class Remodeling(Table):
     coupling: Annotated[str, OneOf(COUPLINGS, removed={IMPLICIT: IN_ITS_PLACE})] = Field(
         default="staggered",
         description=f"Order of solve and remodeling pass in a step. {meanings(COUPLINGS)}. "
-        "The default with the law 'tensor' is 'extrapolated' (docs/laws_and_couplings.md).",
+        "The default with the law 'tensor' is 'extrapolated' (docs/time_integration.md).",
     )
     relaxation_factor: float = Field(default=0.5, gt=0, le=1)
     """Relaxation factor theta of the coupling 'relaxed': the fraction of a pass's change of the
@@ -769,10 +769,10 @@ class Remodeling(Table):
     kappa."""
     threshold: Annotated[float, STRESS] = Field(default=0.0, ge=0)
     """Principal stress s0 up to which a point does not remodel; above it kappa is multiplied by 1 -
-    s0/s. For the law 'tensor' and drivers that are stresses (docs/laws_and_couplings.md)."""
+    s0/s. For the law 'tensor' and drivers that are stresses (docs/time_integration.md)."""
     exponent: float = Field(default=2.0, gt=0, le=16)
     """Exponent n of the target (D+)^n over its trace: 2 is the paper's, 1 is that of netting
-    analysis. For the law 'tensor' (docs/laws_and_couplings.md)."""
+    analysis. For the law 'tensor' (docs/time_integration.md)."""
     mean: Annotated[str, OneOf(MEANS_OF_CASES)] = Field(
         default="tensor",
         description="Mean over several load cases ([[cases]]) that the cells follow. "
@@ -1102,7 +1102,8 @@ class Time(Table):
         json_schema_extra={"allowed": "a finite number greater than 0, or 'equilibrium'"}
     )
     """End time, a multiple of time.step; with a tolerance any time. 'equilibrium': the homeostatic
-    state under the loads at the end of their ramps (docs/theory.md, Equilibrium at once)."""
+    state under the loads at the end of their ramps (docs/time_integration.md, Homeostatic
+    state)."""
     step: float = Field(default=1.0, gt=0)
     """Time between two remodeling passes. With a tolerance it is the first step size."""
     tolerance: float | None = Field(
@@ -1110,8 +1111,8 @@ class Time(Table):
     )
     """Bound of the estimated time discretisation error, in degrees; step sizes then adapt to it.
     The error is that of directions, and that of lengths (1 degree corresponds to 1.7 %;
-    docs/theory.md, Error-controlled steps). With end = 'equilibrium' the default is 3 degrees, or
-    0.5 if a load decreases."""
+    docs/time_integration.md, Error-controlled steps). With end = 'equilibrium' the default is
+    3 degrees, or 0.5 if a load decreases."""
 
     def _faults(self) -> Faults:
         if self.is_equilibrium:

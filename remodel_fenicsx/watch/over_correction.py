@@ -139,7 +139,7 @@ class OverCorrection(WarnsOnce):
                 f"{most}), the displacement by {body_swing.size:.2g} of its size; "
                 f"each pass multiplies this by about {cells_swing.factor:.2g}. "
                 f"Results may be wrong from here on; set {self._advice(cells_swing.factor)} "
-                "(docs/theory.md, Stability of the pass)",
+                "(docs/solver.md, Stability of the pass)",
             )
 
     def _swing(self, times: Array, values: Array, weight: Array) -> Oscillation:
@@ -214,5 +214,5 @@ class ReactivatedCells(WarnsOnce):
             f"changes by {change:.2g} r0^2 (RMS over the body; maximum at "
             f"{self.quadrature.shown_place_of_largest(squares)}). This depends on time.step; set "
             'remodeling.coupling = "relaxed", or a remodeling.law that is a rate '
-            "(docs/theory.md, Stability of the pass)",
+            "(docs/solver.md, Stability of the pass)",
         )

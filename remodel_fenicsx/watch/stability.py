@@ -184,7 +184,7 @@ def described(mode: Mode, unloaded: float) -> str:
 # 1e-6.
 STRAINS = {1: 1e-5, 2: 1e-3}
 # Thrust / Euler's load. It is 0.8 to 1.1 when whole slender tubes lose their stability
-# (docs/theory.md, Buckling).
+# (docs/solver.md, Buckling).
 WARNED_LOAD = 0.9
 AROUND, ALONG = range(1, 3)
 
@@ -215,7 +215,7 @@ class BucklingWarning(WarnsOnce):
         return (
             f"expected buckling: axial thrust is about {share:.2g} times the Euler load. "
             f"Kinematics {self.state.kinematics.name!r} cannot show it; "
-            "set model.kinematics = 'full' (docs/theory.md, Buckling)"
+            "set model.kinematics = 'full' (docs/solver.md, Buckling)"
         )
 
     def thrust(self) -> float:

@@ -184,11 +184,11 @@ class LockingWarning(ElementWarning):
         if missing.volume >= missing.shape:
             return (
                 f"volumetric locking: {lacks} (lambda/mu up to {self.ratio:.4g}); {self.remedy} "
-                "(docs/theory.md, Volumetric locking)"
+                "(docs/solver.md, Volumetric locking)"
             )
         return (
             f"elements too large: {lacks}, because strain varies too much inside elements; set "
-            "mesh.degree = 2 or a larger mesh.refinement (docs/theory.md, Volumetric locking)"
+            "mesh.degree = 2 or a larger mesh.refinement (docs/solver.md, Volumetric locking)"
         )
 
 

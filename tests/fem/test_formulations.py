@@ -154,7 +154,7 @@ def test_a_tube_that_locks_is_told(caplog: Any) -> None:
     )
     assert record.getMessage().endswith(
         " % (lambda/mu up to 1000); set mesh.element = 'hexahedron' and mesh.formulation = "
-        "'selective-integration' (docs/theory.md, Volumetric locking)"
+        "'selective-integration' (docs/solver.md, Volumetric locking)"
     )
     said = float(record.getMessage().split("about ")[1].split(" %")[0]) / 100
     assert lacking == pytest.approx(said, abs=0.15) and lacking > 0.7

@@ -63,8 +63,8 @@ def test_the_python_of_the_readme_runs_as_it_stands(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("name", ["README.md", "CONTRIBUTING.md", *(f"docs/{name}.md" for name in (
-    "architecture", "commands", "environment", "interface", "laws_and_couplings", "report", "theory", "verification",
-    "what_may_go_wrong"))])  # fmt: skip
+    "architecture", "commands", "environment", "interface", "model", "report", "solver", "time_integration",
+    "verification", "what_may_go_wrong"))])  # fmt: skip
 def test_files_and_modules_that_a_page_names_are_there(name: str) -> None:
     """Paths in backticks or links, and modules after the package's name."""
     text = re.sub(r"```.*?```", "", page(name), flags=re.DOTALL)
@@ -106,7 +106,7 @@ def test_sections_that_are_named_are_there() -> None:
     assert not [
         one for one in found if not any(one[2].startswith(head) for head in heads.get(one[1], []))
     ]
-    assert named_sections('"so (docs/theory.md, No "\n    "section)"') == [("theory", "No section")]
+    assert named_sections('"so (docs/model.md, No "\n    "section)"') == [("model", "No section")]
 
 
 def test_commands_that_pages_show_are_commands(capsys: pytest.CaptureFixture[str]) -> None:

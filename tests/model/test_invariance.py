@@ -1,7 +1,7 @@
 """What must not depend on the observer: the deformed body turned, everything turned; and the material frame.
 
 Objectivity: F -> Q F with the reference kept. The frame `material` is objective, the frame `spatial`, which is the
-printed eq. (9), is not (docs/theory.md, erratum 4): shown here, with numbers. Equivariance: F -> Q F Q^T with
+printed eq. (9), is not (docs/model.md, erratum 4): shown here, with numbers. Equivariance: F -> Q F Q^T with
 n_I(0) -> Q n_I(0), which both are.
 """
 

@@ -1,7 +1,7 @@
 """Bodies of one dimension through time, their axes fixed: references of the map and of random scenes.
 
-Typed from docs/theory.md on top of tests/reference/radial.py, which shares no code with the package. A cube or bar is
-one point, a tube is divided along its radius; cells are three squares l_d^2 by direction.
+Typed from docs/time_integration.md on top of tests/reference/radial.py, which shares no code with the package. A cube
+or bar is one point, a tube is divided along its radius; cells are three squares l_d^2 by direction.
 """
 
 from __future__ import annotations

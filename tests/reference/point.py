@@ -1,4 +1,4 @@
-"""A material point of the tissue under any deformation that is given, typed by hand from the paper and docs/theory.md.
+"""A material point of the tissue under any deformation that is given, typed by hand from the paper and docs/model.md.
 
 Shares no code with the package. Equilibrium of a point whose axes stay is in tests/reference/march.py.
 """
