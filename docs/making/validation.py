@@ -165,7 +165,7 @@ def agreements() -> Iterator[Row]:
             read_scene(DEMOS / "sheet.toml").with_values({**changes, "remodeling.half_life": 2.0})
         )
         theirs = np.degrees(np.arctan2(found["cauchy_stress_y"], found["cauchy_stress_x"]))
-        label = "V10 sheet at rest, forces {} and {} N, degrees".format(*forces)
+        label = "V10 sheet in the steady state, forces {} and {} N, degrees".format(*forces)
         yield row(label, "tan a = sigma_y / sigma_x", theirs, found["fibre_angle"], 0.05, False)
     force = 1.381e-23 * 310.0 / 14.5e-9 * 0.5 * extend.CHAINS["wormlike"].stiffness(0.5, 1.0)
     yield row(

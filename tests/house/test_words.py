@@ -12,8 +12,7 @@ import pytest
 WORDS = runpy.run_path(str(Path(__file__).parent / "words"))
 CEILINGS = {  # of today, they may only fall; 0 for all others
     "Any in annotations": 231,
-    "banned terms in pages": 223,
-    "review terms": 268,
+    "review terms": 222,
 }
 
 

@@ -388,7 +388,7 @@ def test_the_page_leads_from_a_curve_to_numbers(
     """docs/fit.md: its files and commands and its fit as they stand; the numbers are the page's."""
     monkeypatch.chdir(tmp_path)
     page = (ROOT / "docs" / "fit.md").read_text(encoding="utf-8")
-    page = page[page.index("## A pressure-radius curve") : page.index("## The two files")]
+    page = page[page.index("## A measured pressure-radius curve") : page.index("## The two files")]
     for name, text in re.findall(
         r"^```(?:text|toml)\n# (\S+)\n(.*?)^```", page, re.MULTILINE | re.DOTALL
     ):
