@@ -200,7 +200,7 @@ _Stretch = Annotated[float, Field(gt=0)]
 
 
 class Elastin(Table):
-    """Prestretch of the matrix, which stands for elastin (docs/tissue_that_lives.md, Elastin)."""
+    """Prestretch of the matrix, which stands for elastin (docs/turnover.md, Elastin)."""
 
     prestretch: Annotated[tuple[_Stretch, _Stretch], IN_A_LIST] = Field(
         default=(1.0, 1.0), json_schema_extra={"allowed": "two numbers greater than 0"}
@@ -383,7 +383,7 @@ _From: Any = with_key(
 
 
 class NaturalLayer(_From):  # type: ignore[misc]
-    """Layer that was stretched before it was joined to the wall (docs/tissue_that_lives.md)."""
+    """Layer that was stretched before it was joined to the wall (docs/turnover.md)."""
 
     to: float = Field(default=1.0, gt=0, le=1)
     """End of the layer."""
@@ -411,7 +411,7 @@ AS_GIVEN: Literal["as-given"] = "as-given"
 
 
 class Natural(Table):
-    """Stress-free configuration, if it is not the mesh (docs/tissue_that_lives.md)."""
+    """Stress-free configuration, if it is not the mesh (docs/turnover.md)."""
 
     opening_angle: float = Field(default=0.0, ge=0, le=180)
     """For a tube: the angle of the missing sector of a cut ring, in degrees. Fung's opening angle
@@ -776,7 +776,7 @@ class Remodeling(Table):
     mean: Annotated[str, OneOf(MEANS_OF_CASES)] = Field(
         default="tensor",
         description="Mean over several load cases ([[cases]]) that the cells follow. "
-        f"{meanings(MEANS_OF_CASES)} (docs/cycles.md).",
+        f"{meanings(MEANS_OF_CASES)} (docs/turnover.md, Load cases).",
     )
     rotation_time: float = Field(default=40.0, gt=0)
     """For the law 'rotation': a small angle between fibre and tension decays as exp(-t /
@@ -1055,7 +1055,7 @@ SUM_OF_WEIGHTS = 1e-9  # tolerance for the sum of case weights: rounding, and 1/
 
 
 class LoadCase(Table):
-    """Load case of a cycle, such as diastole: fraction of the time, and loads (docs/cycles.md).
+    """Load case of a cycle, such as diastole: fraction of the time, and loads (docs/turnover.md).
 
     Every case is a state of its own, solved with the same cells. The cells follow a mean over the
     cases. The columns and fields of a run are those of the first case. The further cases have
