@@ -35,7 +35,7 @@ def site(tmp_path_factory: pytest.TempPathFactory) -> Path:
 BEST = {  # where a reader wants to be
     "residual stress": "turnover",
     "mmHg": "tutorial_tube",
-    "resume": "howto_resume",
+    "resume": "howto_ranks",
     "STL": "my_own_vessel",
     "systole": "turnover",
 }
