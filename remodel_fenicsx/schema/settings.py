@@ -252,10 +252,10 @@ class Material(Table):
     """Persistence length A_p of a chain, in link lengths: its bending stiffness over k theta."""
     initial_stiffness: Annotated[float | None, STRESS] = Field(default=None, gt=0)
     """Replaces chain_density: the slope of a measured curve at stretch 1, nominal stress of the
-    network over stretch along aligned chains, in stress_unit (docs/which_numbers.md)."""
+    network over stretch along aligned chains, in stress_unit (docs/concepts.md)."""
     locking_stretch: float | None = Field(default=None, gt=1)
     """Replaces contour_length: the stretch L / r0 at which aligned chains lock
-    (docs/which_numbers.md)."""
+    (docs/concepts.md)."""
     temperature: Annotated[float, TEMPERATURE] = Field(default=310.0, gt=0)
     """Absolute temperature theta, in K."""
     energy_factor: Annotated[int, OneOf((1, 4))] = 1
