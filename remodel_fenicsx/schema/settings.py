@@ -1292,7 +1292,7 @@ class Output(Table):
     """Times up to time.end that have a row and fields in any case. They must be multiples of
     time.step. With time.tolerance a step ends at each."""
     report: bool = True
-    """Write a page of the run for a browser, report.html, at its end (docs/report.md)."""
+    """Write a page of the run for a browser, report.html, at its end (docs/commands.md)."""
     checkpoint: int | None = Field(default=None, ge=0)
     """Number of steps between two checkpoints; 0 means only at the end. By default at most 10
     minutes are lost, and checkpoints cost less than 5 % of the run."""

@@ -34,7 +34,6 @@ SCRIPT = "import runpy, sys; sys.path.insert(0, '.'); del sys.argv[0]; runpy.run
 PAGES = [
     "start",
     "fit",
-    "report",
     *sorted(
         page.stem for kind in ("tutorial", "howto") for page in (ROOT / "docs").glob(f"{kind}_*.md")
     ),
