@@ -63,7 +63,7 @@ def test_the_python_of_the_readme_runs_as_it_stands(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("name", ["README.md", "CONTRIBUTING.md", *(f"docs/{name}.md" for name in (
-    "architecture", "commands", "environment", "interface", "laws_and_couplings", "theory", "verification",
+    "architecture", "commands", "start", "interface", "laws_and_couplings", "theory", "verification",
     "what_may_go_wrong"))])  # fmt: skip
 def test_files_and_modules_that_a_page_names_are_there(name: str) -> None:
     """Paths in backticks or links, and modules after the package's name."""
