@@ -1,4 +1,4 @@
-# The same Debian packages as ./with-fenicsx, and the remodel-fenicsx command.  docs/environment.md tells more.
+# The same Debian packages as ./with-fenicsx, and the remodel-fenicsx command.  docs/start.md tells more.
 #   docker build -t remodel-fenicsx .
 #   docker run --rm --user "$(id -u):$(id -g)" -v "$PWD:/data" remodel-fenicsx run demos/artery.toml
 

@@ -150,7 +150,7 @@ def last_of_tissue(curve: Callable[[float], Array], up_to: float) -> float:
 
 
 def in_words(c: float, length: float, mu: float, cells: Array, unit: str) -> str:
-    """A scene's tables, and the readings of docs/which_numbers.md."""
+    """A scene's tables, and the readings of docs/concepts.md."""
     stiffness = c * aligned_stiffness(CHAIN, 1.0, length)
     density = c / Material(chain_density=1.0, stress_unit=unit).network_modulus  # type: ignore[arg-type]
     return f"""[material]

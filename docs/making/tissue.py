@@ -1,4 +1,4 @@
-"""The two pictures of docs/tissue_that_lives.md and their tables, in ten minutes.
+"""The two pictures of docs/turnover.md and their tables, in ten minutes.
 
 Four tubes on one radius, with opening angles of 0 to 160 degrees; and for which gain and deposition stretch a thin and
 a thick wall that start free of stress come to rest.

@@ -400,6 +400,6 @@ class UnboundedGrowth(WarnsOnce):
             f"{100 * rate * period:.2g} % within one remodeling.turnover.time, most at "
             f"{self.quadrature.shown_place_of_largest(rates)}, and the rates have decayed no "
             f"faster than 1/t since time {self.last_load_change + self._numbers['early_time']:g} "
-            "(mechanobiological instability, docs/tissue_that_lives.md). "
+            "(mechanobiological instability, docs/turnover.md). "
             "Try a larger remodeling.turnover.gain"
         )

@@ -8,7 +8,7 @@ Stresses, drivers, residual and tangent follow by differentiation. Per reference
     W_chn  = c psi(r),  r^2 = sum_I l_I^2 I_I,  I_I = n_I . C n_I = f_I . f_I,  f_I = F n_I
     W_rep  = -c/2 g(r0) sum_I l_I^2 ln I_I
 
-With a prestretch G_e of elastin W_iso takes F G_e (docs/tissue_that_lives.md, Elastin).
+With a prestretch G_e of elastin W_iso takes F G_e (docs/turnover.md, Elastin).
 """
 
 from __future__ import annotations

@@ -106,7 +106,7 @@ def profile_for(name: str, scene: Any) -> Profile:
 
 # ---------------------------------------------------------------- experimental parameters
 # For example an initial stiffness in place of a chain density. A scene may set either, never both.
-# The scene as run has the model's own parameters (docs/which_numbers.md).
+# The scene as run has the model's own parameters (docs/concepts.md).
 
 Values = Mapping[str, Any]
 S = TypeVar("S", bound="BaseModel")

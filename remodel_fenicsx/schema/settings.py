@@ -200,7 +200,7 @@ _Stretch = Annotated[float, Field(gt=0)]
 
 
 class Elastin(Table):
-    """Prestretch of the matrix, which stands for elastin (docs/tissue_that_lives.md, Elastin)."""
+    """Prestretch of the matrix, which stands for elastin (docs/turnover.md, Elastin)."""
 
     prestretch: Annotated[tuple[_Stretch, _Stretch], IN_A_LIST] = Field(
         default=(1.0, 1.0), json_schema_extra={"allowed": "two numbers greater than 0"}
@@ -252,10 +252,10 @@ class Material(Table):
     """Persistence length A_p of a chain, in link lengths: its bending stiffness over k theta."""
     initial_stiffness: Annotated[float | None, STRESS] = Field(default=None, gt=0)
     """Replaces chain_density: the slope of a measured curve at stretch 1, nominal stress of the
-    network over stretch along aligned chains, in stress_unit (docs/which_numbers.md)."""
+    network over stretch along aligned chains, in stress_unit (docs/concepts.md)."""
     locking_stretch: float | None = Field(default=None, gt=1)
     """Replaces contour_length: the stretch L / r0 at which aligned chains lock
-    (docs/which_numbers.md)."""
+    (docs/concepts.md)."""
     temperature: Annotated[float, TEMPERATURE] = Field(default=310.0, gt=0)
     """Absolute temperature theta, in K."""
     energy_factor: Annotated[int, OneOf((1, 4))] = 1
@@ -383,7 +383,7 @@ _From: Any = with_key(
 
 
 class NaturalLayer(_From):  # type: ignore[misc]
-    """Layer that was stretched before it was joined to the wall (docs/tissue_that_lives.md)."""
+    """Layer that was stretched before it was joined to the wall (docs/turnover.md)."""
 
     to: float = Field(default=1.0, gt=0, le=1)
     """End of the layer."""
@@ -411,7 +411,7 @@ AS_GIVEN: Literal["as-given"] = "as-given"
 
 
 class Natural(Table):
-    """Stress-free configuration, if it is not the mesh (docs/tissue_that_lives.md)."""
+    """Stress-free configuration, if it is not the mesh (docs/turnover.md)."""
 
     opening_angle: float = Field(default=0.0, ge=0, le=180)
     """For a tube: the angle of the missing sector of a cut ring, in degrees. Fung's opening angle
@@ -776,7 +776,7 @@ class Remodeling(Table):
     mean: Annotated[str, OneOf(MEANS_OF_CASES)] = Field(
         default="tensor",
         description="Mean over several load cases ([[cases]]) that the cells follow. "
-        f"{meanings(MEANS_OF_CASES)} (docs/cycles.md).",
+        f"{meanings(MEANS_OF_CASES)} (docs/turnover.md, Load cases).",
     )
     rotation_time: float = Field(default=40.0, gt=0)
     """For the law 'rotation': a small angle between fibre and tension decays as exp(-t /
@@ -1055,7 +1055,7 @@ SUM_OF_WEIGHTS = 1e-9  # tolerance for the sum of case weights: rounding, and 1/
 
 
 class LoadCase(Table):
-    """Load case of a cycle, such as diastole: fraction of the time, and loads (docs/cycles.md).
+    """Load case of a cycle, such as diastole: fraction of the time, and loads (docs/turnover.md).
 
     Every case is a state of its own, solved with the same cells. The cells follow a mean over the
     cases. The columns and fields of a run are those of the first case. The further cases have
@@ -1293,7 +1293,7 @@ class Output(Table):
     """Times up to time.end that have a row and fields in any case. They must be multiples of
     time.step. With time.tolerance a step ends at each."""
     report: bool = True
-    """Write a page of the run for a browser, report.html, at its end (docs/report.md)."""
+    """Write a page of the run for a browser, report.html, at its end (docs/commands.md)."""
     checkpoint: int | None = Field(default=None, ge=0)
     """Number of steps between two checkpoints; 0 means only at the end. By default at most 10
     minutes are lost, and checkpoints cost less than 5 % of the run."""

@@ -34,7 +34,6 @@ SCRIPT = "import runpy, sys; sys.path.insert(0, '.'); del sys.argv[0]; runpy.run
 PAGES = [
     "start",
     "fit",
-    "report",
     *sorted(
         page.stem for kind in ("tutorial", "howto") for page in (ROOT / "docs").glob(f"{kind}_*.md")
     ),
@@ -198,11 +197,11 @@ def test_the_tube_of_the_readme_is_that_of_its_tutorial_and_so_are_its_numbers()
 def test_numbers_of_an_experiment_go_into_the_tutorials_scene(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """docs/which_numbers.md: its table in place of the one of `tube.toml`."""
+    """docs/concepts.md: its table in place of the one of `tube.toml`."""
     monkeypatch.chdir(tmp_path)
     for _, text in blocks(TUBE):
         keep(text)
-    page = (ROOT / "docs" / "which_numbers.md").read_text(encoding="utf-8")
+    page = (ROOT / "docs" / "concepts.md").read_text(encoding="utf-8")
     (table,) = re.findall(r"^```toml\n(\[material\]\n.*?)^```", page, re.MULTILINE | re.DOTALL)
     scene = re.sub(
         r"^\[material\]\n.*?(?=^\[)",

@@ -33,11 +33,11 @@ def site(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 BEST = {  # where a reader wants to be
-    "residual stress": "tissue_that_lives",
+    "residual stress": "turnover",
     "mmHg": "tutorial_tube",
-    "resume": "howto_resume",
+    "resume": "howto_ranks",
     "STL": "my_own_vessel",
-    "systole": "cycles",
+    "systole": "turnover",
 }
 
 

@@ -1,7 +1,7 @@
 """A tube on one radius with residual stress, turnover and growth: Chebyshev collocation and Runge-Kutta's fourth order.
 
 It shares no code with the package: equations of docs/model.md (law `tensor`, repulsion `log`) and
-tissue_that_lives.md, for cells that lie along the axes around (0), along (1) and across the wall (2).
+turnover.md, for cells that lie along the axes around (0), along (1) and across the wall (2).
 """
 
 from __future__ import annotations

@@ -38,7 +38,7 @@ _WithStart: Any = with_key(
 
 
 class Turnover(_WithStart, ProcessTable):  # type: ignore[misc]
-    """Removal and deposition of collagen, if `time` is set (docs/tissue_that_lives.md).
+    """Removal and deposition of collagen, if `time` is set (docs/turnover.md).
 
     For the law `tensor`.
     """
