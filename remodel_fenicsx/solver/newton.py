@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import partial
 from typing import TypeVar
 
@@ -135,6 +135,9 @@ LINE_SEARCH_HALVINGS = 20  # number of halvings of a Newton step before the line
 # Number of Newton steps in a row, and of halvings of each, after which a solve fails. Solves that
 # succeed have at most two such steps; on a thin wall under too much load all steps are as short.
 SHORT_STEPS, SHORT_STEP_HALVINGS = 4, 6
+# Number of iterations within which the residual must halve if it exceeds its first value. Lagged
+# tangents need up to three for it; without the limit an aorta's first load step took 13 to fail.
+DIVERGENCE_WINDOW = 4
 # Smallest displacement of a jump, relative to the body's size; for a tube ten radii long this is
 # 1 % of its radius.
 POSSIBLE_JUMP = 1e-3
@@ -198,13 +201,26 @@ class _Solve:
 
     step_start: Array  # unknowns at the start of the step
     first_iterate: float | None = None
-    norm: float = np.inf
-    previous: float = np.inf
+    norms: list[float] = field(default_factory=list)  # of the residual in each iteration
     inadmissible: bool = False
     # All states whose |dF| from the last evaluated state is below this are admissible.
     safe_change: float = 0.0
     is_known_admissible: bool = False  # without an evaluation, because |dF| is below safe_change
     short_steps: int = 0  # number of Newton steps in a row that the guards have made very short
+
+    @property
+    def previous(self) -> float:
+        """Norm of the residual one iteration before the last one, or infinity."""
+        return self.norms[-2] if len(self.norms) > 1 else np.inf
+
+    @property
+    def diverges(self) -> bool:
+        """Whether the residual exceeds its first value and has not halved for some iterations."""
+        norms = self.norms
+        return (
+            len(norms) > DIVERGENCE_WINDOW
+            and norms[-1] > max(norms[0], norms[-1 - DIVERGENCE_WINDOW] / 2)
+        )
 
 
 # By PETSc's SNESConvergedReason, as numbers, because the names differ between its versions.
@@ -213,9 +229,10 @@ SNES_REASONS = {
     -4: "overflow or NaN in the residual; check units and magnitudes of loads and parameters",
     -6: "the line search did not reduce the residual",
     -8: "the guards r < L and J > 0 make all Newton steps too short",
-    -9: "the residual diverged",
+    -9: "the residual diverges",
 }
 DIVERGED_MAX_IT = -5
+LARGE = 50_000  # number of unknowns above which an iteration takes seconds, so that it is shown
 
 
 def failure_text(reason: int, iterations: int, limits: StateLimits) -> str:
@@ -271,7 +288,7 @@ class GuardedNewton:
         snes: PETSc.SNES = PETSc.SNES().create(equilibrium.comm)
         snes.setFunction(self._assemble_residual, self._residual)
         snes.setJacobian(
-            lambda *_: self.linear.tangent(self._present.norm, self.convergence.goal()),
+            lambda *_: self.linear.tangent(self._present.norms[-1], self.convergence.goal()),
             self._matrix,
         )
         snes.setLineSearchPreCheck(self._keep_admissible)
@@ -280,6 +297,8 @@ class GuardedNewton:
         # A PETSc option of the user may have changed it.
         self._most_iterations = snes.getTolerances()[3]
         snes.setConvergenceTest(self._converged)
+        if unknowns > LARGE:
+            snes.setMonitor(self._show)
         self._snes: PETSc.SNES = snes
         self.linear: FullNewton = SOLVER_METHODS[method].make_linear(
             equilibrium, snes, self._matrix, self._options
@@ -404,6 +423,9 @@ class GuardedNewton:
             log.warning("solver.petsc_options: without effect (misspelt?): %s", ", ".join(unused))
 
     # ------------------------------------------------------------ SNES
+    def _show(self, snes: PETSc.SNES, iteration: int, norm: float) -> None:
+        self.equilibrium.state.tell(f"Newton iteration {iteration}, residual {norm:.2g}")
+
     def _to_petsc(self, x: PETSc.Vec) -> None:
         """Copy the unknowns into a PETSc vector."""
         with x.localForm() as local:
@@ -510,11 +532,13 @@ class GuardedNewton:
         if not np.isfinite(norm):
             return PETSc.SNES.ConvergedReason.DIVERGED_FNORM_NAN
         present = self._present
-        present.previous, present.norm = present.norm if iteration else np.inf, norm
+        present.norms.append(norm)
         if self.convergence.reached(norm, present.previous):
             return PETSc.SNES.ConvergedReason.CONVERGED_FNORM_ABS
         if present.short_steps >= SHORT_STEPS:
             return PETSc.SNES.ConvergedReason.DIVERGED_LOCAL_MIN
+        if present.diverges:
+            return PETSc.SNES.ConvergedReason.DIVERGED_DTOL
         if iteration >= snes.getTolerances()[3] or self.linear.given_up:
             return PETSc.SNES.ConvergedReason.DIVERGED_MAX_IT
         return PETSc.SNES.ConvergedReason.ITERATING
