@@ -459,7 +459,7 @@ def cheaper_method(equilibrium: Equilibrium) -> str:
     method = LAGGED if is_cheap else "iterative"
     log.info(
         "solver.method 'auto' takes %r: a factorisation needs %.1e operations, %.0f for each entry "
-        "of the tangent, and %.1f GB of %.1f",
+        "of the tangent, and %.1f of %.1f GB of free memory",
         method,
         operations,
         operations / nonzeros,

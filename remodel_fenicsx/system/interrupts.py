@@ -248,14 +248,15 @@ class StopRequest:
     def _send_again(
         self, hook: Callable[[sys.UnraisableHookArgs], object], lost: sys.UnraisableHookArgs
     ) -> None:
-        """Send the signal again if a finaliser has swallowed its exception, as Python does there."""
+        """Send a signal again whose exception Python has ignored, as it does in finalisers."""
         if not isinstance(lost.exc_value, Interrupted):
             hook(lost)
             return
         number, self.number = self.number, 0
         signal.signal(number, self._remember)
         main = threading.main_thread().ident
-        threading.Timer(0.0, signal.pthread_kill, (main, number)).start()
+        # Later, because the hook runs in the finaliser, too.
+        threading.Timer(_ONE_SIGNAL, signal.pthread_kill, (main, number)).start()
 
     def __exit__(self, *error: object) -> None:
         _requests.remove(self)
