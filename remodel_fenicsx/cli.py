@@ -540,6 +540,7 @@ def _axes(options: argparse.Namespace) -> None:
     SCENE_AND_CHANGES,
     "-o --output FOLDER  Write scene and mesh to this new folder (default: NAME-unloaded).",
     needs=COMPUTES,
+    alone=True,
 )
 def _unload(options: argparse.Namespace) -> None:
     """Compute the unloaded body of a scene whose geometry is the loaded one."""

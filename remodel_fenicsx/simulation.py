@@ -58,9 +58,9 @@ class Simulation:
         Time stepping: constant steps, adaptive steps if the scene has a tolerance, or
         steps to the steady state.
     watchers
-        Watchers of the steps, in order: stability of equilibria, the observer, and those of
-        `extend.WATCHERS`. Numbers that they keep between steps belong to the state, so that a
-        resumed run has them too.
+        Watchers of the steps, in order: stability of equilibria, the observer, those of
+        `extend.WATCHERS`, of the processes, and of further load cases. Numbers that they
+        keep between steps belong to the state, so that a resumed run has them too.
 
     Raises
     ------
@@ -113,7 +113,7 @@ class Simulation:
         time
             The time.
         case
-            Index of the load case; 0 is the first.
+            Index of the load case from 0, one less than `Step.case`.
         """
         return values_of_loads(list(self.scene.each_case())[case].loads, time)
 
@@ -205,14 +205,14 @@ def _solver(scene: Scene) -> Solver:
 
 
 def _remodeling(scene: Scene, comm: MPI.Intracomm) -> Remodeling:
-    """Return the remodeling settings; the path to a steady state with random cells is relaxed."""
-    # When the driver's principal values change their order, random cells jump at any step size, and
-    # the passes oscillate.
+    """Return the remodeling settings, with the coupling 'relaxed' if passes would oscillate."""
+    # When the driver's principal values change their order, random cells jump, however small the
+    # step, and the passes oscillate.
     if not (scene.time.is_equilibrium and scene.has_random_cells and scene.cell_order_can_change):
         return scene.remodeling
     if comm.rank == 0:
         log.info(
-            "the path to the equilibrium uses the coupling 'relaxed', because random cells would "
+            "the path to the steady state uses the coupling 'relaxed', because random cells would "
             "otherwise oscillate"
         )
     return scene.remodeling.model_copy(update={"coupling": "relaxed"})
@@ -249,7 +249,7 @@ def _time_stepping(scene: Scene, stepper: Stepper) -> TimeStepping:
 
 
 def watchers(scene: Scene, parts: SimulationParts) -> list[Watcher]:
-    """Return the watchers in order: eigenvalues before the row, warnings after the row."""
+    """Return the watchers in order: for each load case, eigenvalues before the warnings."""
     stepper, unstable = parts.stepper, scene.solver.unstable
     counted = "negative_eigenvalues" in scene.output.columns
     candidates: list[Watcher | None] = [
@@ -272,8 +272,8 @@ def watchers(scene: Scene, parts: SimulationParts) -> list[Watcher]:
 
 
 def reset_simulation(simulation: Simulation, start: Snapshot, scene: Scene) -> bool:
-    """Reset a simulation with new numbers of its scene; return False if it must be rebuilt."""
-    # The numbers are those of tissue, kappa, loads and opening angle.
+    """Reset a simulation to a scene with other numbers; return False if it must be rebuilt."""
+    # The numbers are those of tissue, kappa, loads and residual stress.
     tissue, kappa = parameters_of(scene.properties(), simulation.domain)
     stepper, kinematics = simulation.stepper, simulation.state.kinematics
     parameters = stepper.tissue.parameters

@@ -83,16 +83,16 @@ def named_groups() -> tuple[dict[str, int], dict[str, int]]:
     if not regions or len(kinds) != 1 or not faces:
         raise GeometryError(
             f"{len(regions)} named volumes, {len(kinds)} types of elements, "
-            f"{len(faces)} named faces"
+            f"{len(faces)} named faces; must be at least 1, exactly 1 and at least 1"
         )
     for _, volume in gmsh.model.getEntities(3):
         groups = gmsh.model.getPhysicalGroupsForEntity(3, volume)
         if len(groups) != 1 and len(gmsh.model.mesh.getElements(3, volume)[0]):
             names = (
                 " and ".join(repr(name) for name, tag in regions.items() if tag in groups)
-                or "no named one"
+                or "no physical group"
             )
-            raise GeometryError(f"volume {volume} is in {names}; each must be in one named volume")
+            raise GeometryError(f"volume {volume} is in {names}; each must be in exactly one")
     return faces, regions
 
 

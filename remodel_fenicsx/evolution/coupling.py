@@ -32,8 +32,8 @@ log = logging.getLogger(__name__)
 
 # Record of a target at one point.
 TARGET = np.dtype([("direction", float, (3, 3)), ("switch", float), ("time", float)])
-NO_TIME = -1.0  # time of a target before the first one
-# A point has its first target when the target's switch (1 under tension, 0 without; `tensor_law`)
+NO_TIME = -1.0  # time of a record without a target
+# A point gains a target when the target's switch (1 under tension, 0 without; `tensor_law`)
 # reaches this. Below it the target changes the cells by less than the time error of a step.
 MIN_TARGET_WEIGHT = 0.01
 # The next rate is predicted as a weighted sum of the last SUMMED rates, whose weights are fitted to
@@ -92,8 +92,8 @@ class Predictor:
     def solved(self, step: LoadStep, before: Array, again: bool = False) -> None:
         """Record the rate of a solved step.
 
-        `before` holds the unknowns before the step; in a second solve (`again`) those after the
-        first, and both rates are added.
+        `before` holds the unknowns before this solve. In a second solve of the step (`again`) its
+        rate is added to that of the first.
         """
         unknown = self.state.unknown
         speed = np.asarray((unknown.x.array - before) / step.duration, dtype=np.float64)
@@ -191,7 +191,7 @@ class Coupling(Protocol):
         """Cells of a higher-order rule, (n, 3) and (n, 3, 3), after `remodel`; or None."""
 
     def solve(self, time: float, loads: LoadValues) -> Work:
-        """Solve for equilibrium; `state.equilibrium_cells` are those of the row.
+        """Solve for equilibrium, and store its cells in `state.equilibrium_cells`.
 
         Parameters
         ----------
@@ -244,7 +244,8 @@ class Staggered:
 
     Examples
     --------
-    A custom coupling overrides one of the halves, see `CouplingKind`. A simulation makes it:
+    A custom coupling overrides one of the halves, see `CouplingKind`. A simulation makes it
+    from its class:
 
     >>> from remodel_fenicsx import Simulation, preset_scene
     >>> from remodel_fenicsx.extend import Staggered
@@ -300,7 +301,7 @@ class Staggered:
         before = unknown.x.array.copy()
         step = LoadStep.between(time - state.time, old_loads, loads)
         self._solve(step, time, old_loads, loads, work, again)
-        # A jump shows if cells and loads change together, in substeps from `before`.
+        # To detect a jump, cells and loads change together, in substeps from `before`.
         self._combined_change(time, old_loads, loads).check_for_jump(before, work, again)
         if self.predictor is not None:
             self.predictor.solved(step, before, again)
@@ -499,16 +500,16 @@ class Extrapolated(Staggered):
         self._power = 0.0
         self._start: UnitCell  # the cells at the start of the step
         self._solved_target: Target  # target of the solved state
-        self._has_first_target: Flags  # points whose first target appears in this step
+        self._gains_target: Flags  # points that gain a target in this step
         self._duration = 0.0  # duration of the step
 
     @property
     def higher_order_cells(self) -> UnitCell:
         """Cells computed with a weighted mean of the targets at both ends of the step."""
-        # Points whose first target appears in this step use that target alone.
+        # Points that gain a target in this step use that target alone.
         weight = weight_of_the_end(self.remodeling.kappa * self._duration)
         mean = target_from_records(self._older).towards(self._solved_target, weight)
-        mean = mean.where(self._has_first_target, self._solved_target)
+        mean = mean.where(self._gains_target, self._solved_target)
         return self.remodeling.cells_towards(mean, self._duration, self._start)
 
     def solve(self, time: float, loads: LoadValues) -> Work:
@@ -518,13 +519,13 @@ class Extrapolated(Staggered):
         self._set_cells_after(expected, time)
         work = super().solve(time, loads)
         self._solved_target = self.remodeling.target(self.residual)
-        self._has_first_target = (self._newest["switch"] < MIN_TARGET_WEIGHT) & (
+        self._gains_target = (self._newest["switch"] < MIN_TARGET_WEIGHT) & (
             self._solved_target.switch >= MIN_TARGET_WEIGHT
         )
-        if not count_points(self.state, self._has_first_target):
+        if not count_points(self.state, self._gains_target):
             return work
         cells.set(*self._start[:2])
-        self._set_cells_after(expected.where(self._has_first_target, self._solved_target), time)
+        self._set_cells_after(expected.where(self._gains_target, self._solved_target), time)
         repeated = self.solve_equilibrium(time, loads, again=True)
         self._solved_target = self.remodeling.target(self.residual)
         repeated.substeps += work.substeps - 1
@@ -532,10 +533,10 @@ class Extrapolated(Staggered):
         return repeated
 
     def remodel(self, time: float) -> float:
-        """Record the target of the solved state; the cells are already those of the row."""
+        """Record the target of the solved state, whose cells `solve` has set."""
         self._duration = time - self.state.time
         self._older[:] = self._newest
-        self._older["time"][self._has_first_target] = NO_TIME  # no target before the first
+        self._older["time"][self._gains_target] = NO_TIME  # no older target
         self._newest["direction"], self._newest["switch"] = self._solved_target
         self._newest["time"] = time
         for process in self.remodeling.additional_processes:

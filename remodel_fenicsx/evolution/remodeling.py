@@ -45,14 +45,15 @@ RESIDUAL_STRESS_FACTOR = 20.0
 # below the fraction carries hardly any load, and may be treated as zero.
 MAX_RESIDUAL_STRESS_FRACTION = 1e-2
 # A warning is logged if (stress of the residual) / (body's stress) exceeds this. Measured for the
-# artery on one radius with the law "tensor": ratio 0.02 to 0.05, error of radii below 0.1 %; ratio
-# 0.4, error 2 %.
+# artery in one dimension with the law "tensor": ratio 0.02 to 0.05, error of radii below 0.1 %;
+# ratio 0.4, error 2 %.
 WARNED_RESIDUAL_FRACTION = 0.1
 STRESS_ROUNDINGS = 64.0  # error of a principal value as a multiple of a stress's rounding error
 MIN_ACTIVATION = 0.5  # switch below which a point counts as a point without tension
 LOOSE_SOLVER = (
-    "the residual may correspond to stresses of up to %.2g (stress in the body: %.2g); stresses "
-    "below %.2g are treated as zero. Lower solver.relative_tolerance or solver.absolute_tolerance"
+    "the residual may correspond to stresses of up to %.2g (RMS stress of the body: %.2g); "
+    "stresses below %.2g are treated as zero. Lower solver.relative_tolerance or "
+    "solver.absolute_tolerance"
 )
 
 
@@ -120,7 +121,7 @@ class RemodelingPass(Remodels):
 
     @property
     def depends_on_path(self) -> bool:  # type: ignore[override]
-        """Whether the law has a threshold, below which a tension does not change the cells."""
+        """Whether the steady state depends on the load path: with a threshold it does."""
         return self.settings.threshold > 0.0
 
     def set_kappa(self, kappa: float | Function) -> None:
@@ -158,7 +159,7 @@ class RemodelingPass(Remodels):
         F, tensor = self.driving_tensor()
         noise, rounding = self.noise(F, tensor, residual)
         cells = self.state.cells
-        # If the principal axes of the driver are these, the axes of the cells do not change.
+        # Principal axes of the driver with which the axes of the cells do not change.
         steady = cells.point_cells.axes
         if not self.driver.material and self.frame.carries_axes:
             steady = convected_axes(F, steady)
@@ -213,7 +214,7 @@ class RemodelingPass(Remodels):
         return noise
 
     def relative_switch_threshold(self) -> float:
-        """Return the switch threshold, relative to the body's largest stress so far."""
+        """Return the switch threshold, relative to the body's largest RMS stress so far."""
         # It is 0 without loads, or while that stress is itself a rounding error. Laws with a target
         # remodel at half speed at this tension, and more slowly below it
         # (`tensor_law.switch_threshold`).
@@ -232,7 +233,7 @@ class RemodelingPass(Remodels):
     def updated_cells(
         self, time_old: float, time_new: float, residual: float = 0.0, cells: UnitCell | None = None
     ) -> tuple[UnitCell, Array]:
-        """Compute the cells after a pass, and F (n, 3, 3); `cells` replace the present ones."""
+        """Compute the cells after a pass from `cells` or the present ones, and F (n, 3, 3)."""
         # Cells are flattened over the quadrature points. The state does not change.
         cells = self.state.cells.point_cells if cells is None else cells
         if self._averages_targets:
@@ -242,7 +243,7 @@ class RemodelingPass(Remodels):
         return self.law.update(cells, drive, time_old, time_new), drive.deformation_gradient
 
     def target(self, residual: float = 0.0) -> Target:
-        """Return the target of the structure tensor in the present state, if the law has one."""
+        """Return the target of the structure tensor in the present state; the law must have one."""
         assert self._target is not None
         if self._averages_targets:
             return mean_target(
@@ -255,7 +256,7 @@ class RemodelingPass(Remodels):
         return bool(self.further) and MEANS_OF_CASES[self.settings.mean].of_targets
 
     def without_tension(self, residual: float = 0.0) -> NDArray[np.bool_]:
-        """Return flags (n,) of points with no or hardly any tension, whose cells stay."""
+        """Return flags (n,) of points with no or hardly any tension."""
         drive = self.drive(residual)
         if self.law.target is not None:
             return np.asarray(self.target(residual).switch < MIN_ACTIVATION)
@@ -271,7 +272,7 @@ class RemodelingPass(Remodels):
     def cells_towards(
         self, target: Target, duration: float, cells: UnitCell | None = None
     ) -> UnitCell:
-        """Compute the cells after a time of a constant target; `cells` replace the present ones."""
+        """Compute the cells after a time of a constant target, from `cells` or the present ones."""
         assert self.law.follow is not None
         r0 = self.parameters.at_points().end_to_end_length
         return self.law.follow(
@@ -306,7 +307,7 @@ class RemodelingPass(Remodels):
     def predict_limit(self, time: float, residual: float = 0.0) -> None:
         """Store the cells that a pass to t -> infinity would give; `distance` uses them."""
         # The state does not change. `time` is so long that the initial cells no longer matter
-        # (`Scene.last_time`); a pass up to 2 time therefore reaches the limit.
+        # (`Scene.last_time`); a pass up to `2 * time` therefore reaches the limit.
         full_pass, _ = self.updated_cells(time, 2 * time, residual)
         cells = self.state.cells
         self._last_pass = cells.point_cells.copy(), full_pass
@@ -370,7 +371,7 @@ class RemodelingPass(Remodels):
         return self.quadrature.maximum(np.linalg.norm(change, axis=(-1, -2)) / r0**2)
 
     def apply_change(self, change: Array, factor: float, time: float, residual: float) -> None:
-        """Apply a multiple of the change of a pass up to a time."""
+        """Apply a multiple of a new pass, which also changes the points without tension."""
         remodeled, _ = self.updated_cells(self.state.time, time, residual)
         cells = self.state.cells
         self.set(relaxed(cells.point_cells.copy(), remodeled, factor))

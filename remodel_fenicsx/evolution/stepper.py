@@ -37,12 +37,11 @@ if TYPE_CHECKING:
 
 log = logging.getLogger(__name__)
 
-CHECK_INTERVAL = (
-    5  # steps between two checks of slow changes; a check costs up to a third of a step
-)
+# Steps between two checks of what changes slowly; a check costs up to a third of a step.
+CHECK_INTERVAL = 5
 
 
-@partial(with_old_names, arguments=False)  # only steppers make steps
+@partial(with_old_names, arguments=False)  # no old argument names: only steppers make steps
 @dataclass
 class Step:
     """Record of a time step, filled between the solution and the end of the step.
@@ -107,7 +106,7 @@ class Step:
 
     @property
     def is_due(self) -> bool:
-        """Whether watchers check slow changes here: in the first, last, and every fifth step."""
+        """Whether watchers check what changes slowly: in the first, last, and every fifth step."""
         return self.is_last or self.number % CHECK_INTERVAL == 1
 
     @property
@@ -288,7 +287,7 @@ class LoadCaseSolver:
     load_values
         Function of time that returns the magnitudes of all loads by name.
     load_cases
-        This load case and all further ones.
+        All load cases, if this one is the stepper; otherwise this one alone.
     """
 
     state: State
@@ -313,7 +312,7 @@ class Stepper(LoadCaseSolver):
     tissue
         Parameters of matrix and chains.
     remodeling
-        Driver, law, frame, coupling and kappa.
+        Settings of the remodeling.
     solver
         Solver settings.
     load_values
@@ -356,9 +355,9 @@ class Stepper(LoadCaseSolver):
         self.load_cases = [self]
         # For cells that never change the cheapest coupling is enough.
         name = remodeling.coupling if self.remodeling.law.remodels else "staggered"
-        if processes and name != remodeling.coupling and state.comm.rank == 0:
+        if processes and not coupling and name != remodeling.coupling and state.comm.rank == 0:
             log.warning(
-                "kappa is 0: the cells do not change; %s uses the coupling 'staggered' in place of "
+                "the cells do not change; %s uses the coupling 'staggered' in place of "
                 "%r, with an error of first order in the step size",
                 ", ".join(process.name for process in processes),
                 remodeling.coupling,
@@ -396,7 +395,7 @@ class Stepper(LoadCaseSolver):
     def start(self, watchers: Sequence[Watcher] = ()) -> Step:
         """Pass the present state to watchers as a step.
 
-        A new state is first solved for the equilibrium of the unloaded body.
+        The prestretch of a new state is brought to equilibrium first.
 
         Parameters
         ----------
@@ -444,8 +443,8 @@ class Stepper(LoadCaseSolver):
         watchers, is_last
             Watchers of the step, and whether it is the last step.
         rejected
-            Last rejected attempt at the step. Its work and seconds, which contain those of earlier
-            attempts, are added to the step's.
+            Last rejected attempt at the step. Its work and seconds (those of earlier attempts
+            included) are added to the new step.
         coupling
             Object that solves and remodels in place of the stepper's coupling
             (`homeostasis.Homeostasis`).
@@ -648,6 +647,8 @@ def notify_undone(watchers: Sequence[Watcher], step: Step) -> Iterator[None]:
 def times(end: float, step: float) -> Iterator[float]:
     """Yield times of steps: decimal multiples of the step (3 * 0.1 is 0.3), and the end.
 
+    The last step takes the remainder: 0.5 to 1.5 of a step.
+
     Parameters
     ----------
     end
@@ -676,13 +677,13 @@ def times(end: float, step: float) -> Iterator[float]:
 # ---------------------------------------------------------------- intended stops between two steps
 # A signal requests the stop, or the wall time limit requires it.
 
-MARGIN = 1.2  # wall time reserved for the next step / that of the longest recent step
+MARGIN = 1.2  # wall time reserved for the next step, as a multiple of the longest recent one
 NOT_ASKED, BY_SIGNAL, BY_CLOCK = range(3)
 REASONS = {BY_SIGNAL: "stopped by SIGUSR1", BY_CLOCK: "stopped before --max-wall-time is over"}
 
 
 class Pause(Watcher):
-    """Watcher that raises `Paused` on all ranks on request, or before a time limit."""
+    """Watcher that raises `Paused` on all ranks, on request or for a limit of wall time."""
 
     def __init__(
         self,
@@ -694,7 +695,7 @@ class Pause(Watcher):
         self.comm, self.folder = comm, folder
         self.is_requested, self.deadline = is_requested, deadline
         self._last = clock.monotonic()
-        self._seconds = 0.0  # wall time of a step with its output
+        self._seconds = 0.0  # longest wall time of a step with its output; halved with each step
 
     def started(self, step: Step) -> None:
         """Check for a stop before the first step."""

@@ -88,6 +88,7 @@ class Growth:
 
     def set_content(self, content: Array) -> None:
         """Set J_g = 1 + phi (m/m_ref - 1) and G = G_0 (1 - (1 - 1/J_g) N (x) N)."""
+        # Before growth starts, m_ref follows m.
         if self.state.time < self.start:
             self._reference[:] = content
         ratio = self.volume_ratio(content)
@@ -123,7 +124,7 @@ class DecayMonitor:
         self.numbers = numbers
 
     def is_unbounded(self, elapsed: float, rate: float) -> bool:
-        """Return whether the rate decays no faster than 1/t; False while this is unknown."""
+        """Record a rate, and return whether rates decay no faster than 1/t; False if unknown."""
         numbers = self.numbers
         if elapsed >= 2 * numbers["late_time"]:
             numbers["early_time"], numbers["early_rate"] = (
@@ -165,7 +166,7 @@ class TurnoverPass(Remodels):
         # Values of ln m and ln rho. A failed step need not restore them: `before` computes them.
         # `_step_start`: at the start of the step
         # `_last_solved`: in the last solved state
-        # `_present`: in the equilibrium of this step, and in its row
+        # `_present`: in the equilibrium of this step
         # `_higher_order`: by the higher-order rule, for the error of the step
         self._step_start = self._last_solved = self._present = self.logarithms()
         self._higher_order = self._present
@@ -186,7 +187,7 @@ class TurnoverPass(Remodels):
     # ------------------------------------------------------------ over a step
     def before(self, time: float, order: int) -> None:
         """Change m and rho before the step is solved."""
-        # Order 1: over the last step, with the rates of its row. Order 2: over this step, with
+        # Order 1: the last rates apply over the last step. Order 2: over this step, with
         # rates that are extrapolated to its middle.
         duration, last = time - self.state.time, self._numbers["duration"]
         rates = self.rates()
@@ -220,8 +221,8 @@ class TurnoverPass(Remodels):
 
     def after(self, time: float) -> float:
         """Compute the higher-order values, and return 0."""
-        # The power of turnover has a column of its own (`power`), and is not added to that of the
-        # cells.
+        # The power of turnover has a column of its own (`turnover_power`), and is not added to that
+        # of the cells.
         duration = time - self.state.time
         self._higher_order = changed(self._present, self.rates(), duration)
         if self._start_rates is not None:
@@ -269,7 +270,7 @@ class TurnoverPass(Remodels):
 
     def apply_change(self, change: Array, factor: float, time: float, residual: float) -> None:
         """Apply a multiple of the change of `change_to_limit`."""
-        self.change(change.reshape(-1, 2).T, factor)  # as rates over a duration
+        self.change(change.reshape(-1, 2).T, factor)  # as rates over the duration `factor`
 
     def begin_path(self) -> None:
         """Reset the monitor of the rates."""
@@ -286,7 +287,7 @@ class TurnoverPass(Remodels):
         ):
             return ""
         return (
-            "growth has not reached equilibrium: its rates decay no faster than 1/t "
+            "turnover has not reached equilibrium: its rates decay no faster than 1/t "
             "(mechanobiological instability). The result is the state at time "
             f"{self.state.time:g}; try a larger remodeling.turnover.gain"
         )
@@ -309,7 +310,7 @@ class TurnoverPass(Remodels):
             self.growth.set_content(self._values("content"))
 
     def rates(self, present: bool = False) -> Array:
-        """Return d ln m / dt and d ln rho / dt of the row, (2, n); mean over load cases."""
+        """Return d ln m / dt and d ln rho / dt, (2, n), mean over load cases; see `_rates`."""
         states = (self.state, *self.state.other_cases)
         return np.asarray(
             sum(
@@ -319,13 +320,13 @@ class TurnoverPass(Remodels):
         )
 
     def _rates(self, state: State, present: bool) -> TurnoverRates:
-        """Return the rates in one load case, with present cells or those of the row."""
+        """Return the rates in one load case, with present cells or those of the solved state."""
         cells = state.cells if present else state.equilibrium_cells
         squared = cells.kernels.squared_length(state.elastic_gradient(), cells.point_cells)
         return self.settings.rule.at_length(self._parameters.at_points(), np.sqrt(squared))
 
     def power(self) -> float:
-        """Return the stored energy per time that turnover releases, at F and cells of the row."""
+        """Return the stored energy per time that turnover releases in the solved state."""
         cells = self.state.equilibrium_cells.point_cells
         increment = self._parameters.at_points().turnover_increment(
             self.state.elastic_gradient(), cells, *self.rates()
@@ -354,7 +355,7 @@ class TurnoverPass(Remodels):
         return np.abs(self.rates()).max(axis=0).reshape(self.quadrature.shape)
 
     def factors(self, name: str) -> Array:
-        """Return the change factors of `content` or `natural_length`, >= 1, (elements, points)."""
+        """Return max(x, 1/x) for x = `content` or `natural_length`, (elements, points)."""
         return np.exp(np.abs(np.log(self._values(name))))
 
 

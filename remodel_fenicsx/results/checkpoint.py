@@ -160,8 +160,8 @@ def _check(state: State, domain: Domain, checkpoint: Checkpoint, mesh: dict[str,
     same = points.shape == mesh["points"].shape and np.array_equal(elements, mesh["elements"])
     if not same or not np.allclose(points, mesh["points"], rtol=0.0, atol=1e-9 * domain.size):
         raise CheckpointError(
-            "the checkpoint has another mesh: perhaps Gmsh is of another version, "
-            "run.log says which it was"
+            "the checkpoint has another mesh; perhaps Gmsh has another version now (run.log names "
+            "that of the run)"
         )
 
 

@@ -112,7 +112,7 @@ def read_file(path: Path) -> Checkpoint:
     check_regular(path)
     try:
         with np.load(path, allow_pickle=False) as file, zipfile.ZipFile(path) as archive:
-            # what is compressed may be of any size: a checkpoint is not
+            # Compressed data may expand to any size; checkpoints are never compressed.
             if any(entry.compress_type != zipfile.ZIP_STORED for entry in archive.infolist()):
                 raise ValueError("compressed")
             header = file[_HEADER].tobytes()

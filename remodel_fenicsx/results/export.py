@@ -134,9 +134,9 @@ def recorded_fibres(recording: RecordedRun, time: float | None = None) -> Fibres
     """Read the cells of a run at a recorded time; None is the last one."""
     kinematics = recording.scene.model.kinematics
     if KINEMATICS[kinematics].reduced:
-        remedy = "revolve writes the fields of the whole body, model.kinematics = 'full' runs it"
+        remedy = "revolve writes the fields of the whole body, as does model.kinematics = 'full'"
         raise RecordingError(
-            f"{recording.path}: its kinematics are {kinematics!r}, a part of the body; {remedy}"
+            f"{recording.path}: its kinematics {kinematics!r} model a part of the body; {remedy}"
         )
     if not len(recording.times):
         raise RecordingError(f"{recording.path}: the run recorded no fields")

@@ -53,7 +53,8 @@ def read_toml(path: Path) -> dict[str, Any]:
     for number, words in enumerate(text.splitlines(), start=1):
         if not words.lstrip().startswith("#") and _DECIMAL.sub("", words).count(".") > MOST_PARTS:
             raise SceneError(
-                f"{path}: line {number}: a key of more than {MOST_PARTS} parts; a scene has up to 4"
+                f"{path}: line {number}: a key of more than {MOST_PARTS} parts; "
+                "scene keys have up to 4"
             )
     try:
         values = tomllib.loads(text)
@@ -93,7 +94,7 @@ def parse_override(text: str) -> tuple[str, object]:
     if len(key.split(".")) > MOST_PARTS:
         raise SceneError(
             f"--set {format_value(text)}: a key of more than {MOST_PARTS} parts; "
-            "a scene has up to 4"
+            "scene keys have up to 4"
         )
     if not all(key.split(".")):
         raise SceneError(
@@ -284,7 +285,7 @@ def _cells(data: bytes, headers: Collection[str]) -> tuple[list[str], list[list[
     try:
         text = data.decode("utf-16" if wide else "utf-8-sig")
     except UnicodeDecodeError as error:
-        raise UnreadableFile("is not text in UTF-8") from error
+        raise UnreadableFile("is not text in UTF-8 or UTF-16") from error
     lines = [
         line for line in text.splitlines() if line.strip() and not line.lstrip().startswith("#")
     ]

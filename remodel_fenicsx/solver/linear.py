@@ -459,7 +459,7 @@ def cheaper_method(equilibrium: Equilibrium) -> str:
     method = LAGGED if is_cheap else "iterative"
     log.info(
         "solver.method 'auto' takes %r: a factorisation needs %.1e operations, %.0f for each entry "
-        "of the tangent, and %.1f GB of %.1f",
+        "of the tangent, and %.1f of %.1f GB of free memory",
         method,
         operations,
         operations / nonzeros,
@@ -549,9 +549,9 @@ class Lagged(FullNewton):
         )
 
     def fallback(self) -> tuple[str, AbstractContextManager[None]] | None:
-        return (
-            None if self._always else ("with a new factorisation in every iteration", self._anew())
-        )
+        if self.tangents - self._before >= self.snes.getIterationNumber():
+            return None  # Each iteration had its own tangent already.
+        return "with a new factorisation in every iteration", self._anew()
 
     def _costs_more(self, tolerance: float) -> bool:
         """Return whether the remaining iterations cost more than factorising, or diverge."""

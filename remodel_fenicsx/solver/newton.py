@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import partial
 from typing import TypeVar
 
@@ -41,23 +41,25 @@ F = TypeVar("F", bound=Exception)
 # The residual must not exceed a tolerance. The tolerance is at least the rounding error.
 
 FORCE_ROUNDINGS = 8.0  # accepted residual as a multiple of the rounding error of assembled forces
-# Accepted residual as a multiple of the force of rounded displacements, whose strain is eps |u|/h.
-# On thin and on stiff walls 0.07 to 4 was measured.
+# Accepted residual as a multiple of the force due to rounded displacements, whose strain is
+# eps |u|/h. On thin and on stiff walls 0.07 to 4 was measured.
 ROUNDED_STRAINS = 8.0
 # Largest error of a prescribed displacement, relative to the body's size. It needs a tolerance of
 # its own, because the residual is zero at constrained dofs.
 PRESCRIBED_TOLERANCE = 1e-10
-# Error of prescribed values up to rounding, relative to the body's size.
+# Gap below which prescribed values count as met, relative to the body's size.
 PRESCRIBED_ROUNDING = 1e-13
 # Residual of all substeps but the last, relative to the nodal forces. Jump detection compares the
-# directions of successive substeps, which may be as short as 1/256 of a step. With 1e-3 the
+# displacements of successive substeps, which may be as short as 1/256 of a step. With 1e-3 the
 # quasi-Newton solver stopped too early, and some substeps were mistaken for jumps.
 INTERMEDIATE_TOLERANCE = 1e-5
 NEARLY_STRAIGHT = 0.99  # r/L above which the rounding error of one point may dominate
-COARSE = 1e-8  # tolerance / nodal forces; above this, the rounding error of one point dominates
-# Ratio of two successive residuals above which Newton's method stagnates. Only then is a residual
-# accepted because of rounding errors of displacements, and, with nearly straight chains, because of
-# any rounding errors.
+COARSE = (
+    1e-8  # tolerance / nodal forces; above both limits, the rounding error of one point dominates
+)
+# Ratio of two successive residuals above which Newton's method stagnates. A residual that only
+# rounded displacements explain is accepted only then; with nearly straight chains, so is one that
+# only rounded stresses explain.
 STAGNATION = 0.25
 
 
@@ -82,15 +84,16 @@ class Convergence:
         self.set_max_chain_extension(self.max_chain_extension)
 
     def set_max_chain_extension(self, max_chain_extension: float) -> None:
-        """Set the largest r/L of an admissible state, and the rounding error of its stress."""
+        """Set the largest r/L of the present state, and the rounding error of its stress."""
         self.max_chain_extension = max_chain_extension
         self._stress_rounding = stress_rounding(self._largest, max_chain_extension)
 
     def reached(self, norm: float, previous: float) -> bool:
         """Return whether a residual norm is accepted; `previous`: the norm before, or infinity."""
         # The rounding error is computed for the largest r/L and the largest displacement of the
-        # body. Near L it may be far above the rounding error of most points. A residual that only
-        # this error allows is therefore accepted only if Newton's method stagnates.
+        # body. Near L it may be far above the rounding error of most points. A residual that
+        # only this error allows is then (`coarse`) accepted only if Newton's method stagnates;
+        # otherwise that holds for rounded displacements alone.
         if self.prescribed_gap > PRESCRIBED_TOLERANCE:
             return False
         if self.intermediate and norm <= INTERMEDIATE_TOLERANCE * self.force_scale:
@@ -133,8 +136,13 @@ NEAR_LIMIT, RESERVE = 0.95, 0.3
 NOT_EVALUATED = StateLimits(0.0, 1.0, (np.nan,) * 3)
 LINE_SEARCH_HALVINGS = 20  # number of halvings of a Newton step before the line search fails
 # Number of Newton steps in a row, and of halvings of each, after which a solve fails. Solves that
-# succeed have at most two such steps; on a thin wall under too much load all steps are as short.
+# succeed have at most two such steps; on a thin wall under too much load all steps are that short.
 SHORT_STEPS, SHORT_STEP_HALVINGS = 4, 6
+# A solve of a large body diverges if its residual exceeds DIVERGED times the first one and has not
+# halved within DIVERGENCE_WINDOW iterations after the first. Without this limit, the first load
+# step of an aorta fails after 13 iterations at 13 times, each with a factorisation. Small bodies
+# may take all iterations, because some succeed after such a residual.
+DIVERGED, DIVERGENCE_WINDOW = 3.0, 4
 # Smallest displacement of a jump, relative to the body's size; for a tube ten radii long this is
 # 1 % of its radius.
 POSSIBLE_JUMP = 1e-3
@@ -197,38 +205,42 @@ class _Solve:
     """Data of one solve."""
 
     step_start: Array  # unknowns at the start of the step
-    first_iterate: float | None = None
-    norm: float = np.inf
-    previous: float = np.inf
-    inadmissible: bool = False
-    # All states whose |dF| from the last evaluated state is below this are admissible.
+    first_iterate: float | None = None  # its distance from the start of the step
+    norms: list[float] = field(default_factory=list)  # of the residual in each iteration
+    previous: float = np.inf  # last norm but one
+    inadmissible: bool = False  # also on a request to stop
+    # All states whose |dF| from the present iterate is below this are admissible.
     safe_change: float = 0.0
-    is_known_admissible: bool = False  # without an evaluation, because |dF| is below safe_change
+    is_known_admissible: bool = False  # without an evaluation, because safe_change is positive
     short_steps: int = 0  # number of Newton steps in a row that the guards have made very short
 
 
-# By PETSc's SNESConvergedReason, as numbers, because the names differ between its versions.
+# Keys: PETSc's SNESConvergedReason as numbers, because the names differ between its versions.
 SNES_REASONS = {
     -3: "the linear solver failed",
     -4: "overflow or NaN in the residual; check units and magnitudes of loads and parameters",
     -6: "the line search did not reduce the residual",
     -8: "the guards r < L and J > 0 make all Newton steps too short",
-    -9: "the residual diverged",
+    -9: "the residual diverges",
 }
 DIVERGED_MAX_IT = -5
+LARGE = 50_000  # number of unknowns above which an iteration takes seconds
 
 
 def failure_text(reason: int, iterations: int, limits: StateLimits) -> str:
-    """Return why a solve has failed; if SNES has converged, that its state is not admissible."""
+    """Return why a solve has failed: SNES's reason, or a converged but inadmissible state."""
     if reason >= 0:
-        return f"reached r/L = {limits.max_chain_extension:.4f}, J = {limits.min_jacobian:.4g}"
+        return (
+            f"the state is not admissible: r/L = {limits.max_chain_extension:.4f}, "
+            f"J = {limits.min_jacobian:.4g}"
+        )
     if reason == DIVERGED_MAX_IT:
         return f"no equilibrium within {iterations} Newton iterations"
     return SNES_REASONS.get(reason, f"SNES stopped with reason {reason}")
 
 
 class GuardedNewton:
-    """Newton's method with guards, from the present unknowns; see `close`. Collective."""
+    """Newton's method with guards, from the present unknowns; `close` frees it. Collective."""
 
     def __init__(self, equilibrium: Equilibrium, settings: Solver, robust: bool = False):
         self.equilibrium, self.settings = equilibrium, settings
@@ -255,7 +267,7 @@ class GuardedNewton:
             self.method = method = cheaper_method(equilibrium)
         # In three dimensions PETSc's LU replaces MUMPS only with 'auto', so that the results of a
         # named method do not depend on the size.
-        # PETSc's LU does not pivot, as a constraint needs.
+        # A constraint needs pivoting, which PETSc's LU does not have.
         small = is_small(unknowns, is_reduced) and (is_reduced or settings.method == AUTO)
         small &= not kinematics.number_of_constraints
         self._options = ProblemOptions(method_options(method, ranks, small), settings.petsc_options)
@@ -271,7 +283,7 @@ class GuardedNewton:
         snes: PETSc.SNES = PETSc.SNES().create(equilibrium.comm)
         snes.setFunction(self._assemble_residual, self._residual)
         snes.setJacobian(
-            lambda *_: self.linear.tangent(self._present.norm, self.convergence.goal()),
+            lambda *_: self.linear.tangent(self._present.norms[-1], self.convergence.goal()),
             self._matrix,
         )
         snes.setLineSearchPreCheck(self._keep_admissible)
@@ -280,6 +292,9 @@ class GuardedNewton:
         # A PETSc option of the user may have changed it.
         self._most_iterations = snes.getTolerances()[3]
         snes.setConvergenceTest(self._converged)
+        self._is_large = unknowns > LARGE
+        if self._is_large:
+            snes.setMonitor(self._show)
         self._snes: PETSc.SNES = snes
         self.linear: FullNewton = SOLVER_METHODS[method].make_linear(
             equilibrium, snes, self._matrix, self._options
@@ -369,7 +384,7 @@ class GuardedNewton:
         return self._length(change[: state.number_of_owned_unknowns]) / present.first_iterate
 
     def _length(self, change: Array) -> float:
-        """Return the norm of a change of the unknowns that this rank owns. Collective."""
+        """Return the norm over all ranks; `change` holds owned unknowns. Collective."""
         return float(np.sqrt(allreduce(self.equilibrium.comm, float(change @ change), MPI.SUM)))
 
     def newton_correction(self, equilibrium: Equilibrium, tangents: int) -> Array:
@@ -404,6 +419,9 @@ class GuardedNewton:
             log.warning("solver.petsc_options: without effect (misspelt?): %s", ", ".join(unused))
 
     # ------------------------------------------------------------ SNES
+    def _show(self, snes: PETSc.SNES, iteration: int, norm: float) -> None:
+        self.equilibrium.state.tell(f"Newton iteration {iteration}, residual {norm:.2g}")
+
     def _to_petsc(self, x: PETSc.Vec) -> None:
         """Copy the unknowns into a PETSc vector."""
         with x.localForm() as local:
@@ -510,11 +528,19 @@ class GuardedNewton:
         if not np.isfinite(norm):
             return PETSc.SNES.ConvergedReason.DIVERGED_FNORM_NAN
         present = self._present
-        present.previous, present.norm = present.norm if iteration else np.inf, norm
+        norms = present.norms
+        present.previous = norms[-1] if norms else np.inf
+        norms.append(norm)
         if self.convergence.reached(norm, present.previous):
             return PETSc.SNES.ConvergedReason.CONVERGED_FNORM_ABS
         if present.short_steps >= SHORT_STEPS:
             return PETSc.SNES.ConvergedReason.DIVERGED_LOCAL_MIN
+        if (
+            self._is_large
+            and len(norms) > DIVERGENCE_WINDOW + 1
+            and norm > max(DIVERGED * norms[0], norms[-1 - DIVERGENCE_WINDOW] / 2)
+        ):
+            return PETSc.SNES.ConvergedReason.DIVERGED_DTOL
         if iteration >= snes.getTolerances()[3] or self.linear.given_up:
             return PETSc.SNES.ConvergedReason.DIVERGED_MAX_IT
         return PETSc.SNES.ConvergedReason.ITERATING

@@ -349,7 +349,7 @@ def _rows(
     log.info("%s: %d of %d rows are used", table.file, sum(map(len, chosen)), len(size))
     for name, gap in gaps.items():
         if gap > 1.0:
-            words = "loading and unloading differ by %.2g standard deviations on the mean"
+            words = "loading and unloading differ by %.2g standard deviations on average"
             remedy = "the model has no hysteresis; rows = 'last loading' takes loading alone"
             log.warning(f"%s, %s: {words}; {remedy}", table.file, name, gap)
     return np.concatenate(chosen), number
@@ -485,7 +485,7 @@ def _check_columns(
             raise SceneError(f"{place}: column time: must lie between 0 and the scene's time.end")
     elif not loads:
         raise SceneError(
-            f"{place}: needs a column of a load with state = {state!r}: {', '.join(scene.loads)}"
+            f"{place}: state = {state!r} needs a column of a load: {', '.join(scene.loads)}"
         )
 
 

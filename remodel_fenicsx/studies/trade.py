@@ -82,9 +82,9 @@ def ladder(scene: Scene) -> list[Setting]:
             values = {key: value for key, value in values.items() if not key.startswith("mesh.")}
         try:
             changed = base.with_values(values)
-        # Corners of ramps are no multiples of the step, or the formulation lacks the element.
+        # For example, corners of ramps are no multiples of the step.
         except SceneError as error:
-            log.debug("left out: %s", error)
+            log.debug("setting left out: %s", error)
             continue
         time = changed.time
         steps = f"step-{time.step:g}" if time.tolerance is None else f"tolerance-{time.tolerance:g}"

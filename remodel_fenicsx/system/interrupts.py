@@ -14,6 +14,7 @@ import time as clock
 import traceback
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import AbstractContextManager, contextmanager, suppress
+from functools import partial
 from pathlib import Path
 from types import FrameType, TracebackType
 
@@ -244,6 +245,19 @@ class StopRequest:
             if self.raises:
                 raise Interrupted(number, on_all_ranks=False)
 
+    def _send_again(
+        self, hook: Callable[[sys.UnraisableHookArgs], object], lost: sys.UnraisableHookArgs
+    ) -> None:
+        """Send a signal again whose exception Python has ignored, as it does in finalisers."""
+        if not isinstance(lost.exc_value, Interrupted):
+            hook(lost)
+            return
+        number, self.number = self.number, 0
+        signal.signal(number, self._remember)
+        main = threading.main_thread().ident
+        # Later, because the hook runs in the finaliser, too.
+        threading.Timer(_ONE_SIGNAL, signal.pthread_kill, (main, number)).start()
+
     def __exit__(self, *error: object) -> None:
         _requests.remove(self)
         self._handled.__exit__(None, None, None)
@@ -262,7 +276,8 @@ def raise_on_signal() -> Iterator[None]:
     if request.number:
         raise Interrupted(request.number, on_all_ranks=False)
     before, request.raises = request.raises, True
+    hook, sys.unraisablehook = sys.unraisablehook, partial(request._send_again, sys.unraisablehook)
     try:
         yield
     finally:
-        request.raises = before
+        request.raises, sys.unraisablehook = before, hook

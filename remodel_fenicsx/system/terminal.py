@@ -34,7 +34,7 @@ class Progress:
         title: str,
         comm_rank: int = 0,
         *,
-        interval: float = 60.0,
+        interval: float = 25.0,
         done: float = 0,
     ):
         self._total, self._title = total_steps, title

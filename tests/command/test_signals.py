@@ -219,3 +219,24 @@ with StopRequest() as stop:
 """
     done = forked("python", program, variables={**os.environ, "OMPI_COMM_WORLD_SIZE": "2"})
     assert done.returncode == 0, done.stderr
+
+
+def test_a_signal_in_a_finaliser_is_not_lost() -> None:
+    """Python ignores exceptions there: a process that a signal should end went on."""
+    program = """
+import os, signal, time, weakref
+from remodel_fenicsx.system.interrupts import Interrupted, StopRequest, raise_on_signal
+class Body: pass
+body = Body()
+watch = weakref.ref(body, lambda _: os.kill(os.getpid(), signal.SIGTERM))
+try:
+    with StopRequest(), raise_on_signal():
+        del body
+        time.sleep(60)
+except Interrupted as interruption:
+    assert interruption.exit_code == 143
+else:
+    raise SystemExit("the signal was lost")
+"""
+    done = forked("python", program)
+    assert done.returncode == 0 and not done.stderr, done.stderr

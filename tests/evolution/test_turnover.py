@@ -69,7 +69,7 @@ def test_growth_has_no_equilibrium_and_says_so(caplog: pytest.LogCaptureFixture)
         last_row(wall("equilibrium", 4.0, GROWS | {"gain": 0.2}, COLUMNS))["natural_length"] > 5.0
     )
     assert (
-        sum("growth has not reached equilibrium" in record.message for record in caplog.records)
+        sum("turnover has not reached equilibrium" in record.message for record in caplog.records)
         == 1
     )
 
@@ -296,7 +296,7 @@ def test_cells_that_stay_are_said_to_take_staggered_turnover(
     caplog: pytest.LogCaptureFixture,
 ) -> None:
     Simulation(scene_from_dict(cube(10.0, 5.0, {}, kappa=0.0, coupling="extrapolated"))).close()
-    assert "kappa is 0" in caplog.text and "in place of 'extrapolated'" in caplog.text
+    assert "the cells do not change" in caplog.text and "in place of 'extrapolated'" in caplog.text
 
 
 def test_tissue_that_loses_nearly_all_of_its_collagen_and_rests_is_no_instability(

@@ -9,14 +9,17 @@ import numpy as np
 import pytest
 import ufl
 
+from remodel_fenicsx import preset_scene
 from remodel_fenicsx.fem import jit, quadrature
 from remodel_fenicsx.model.tensors import determinant_changes_sign
 from remodel_fenicsx.schema.settings import Cells, Material
 from remodel_fenicsx.solver.equilibrium import StateLimits, PointState
+from remodel_fenicsx.solver import newton
 from remodel_fenicsx.solver.newton import SolveFailure
 from tests import parts
 from tests.conftest import slowly
 from tests.parts import cube, smooth, tube
+from tests.runs import made
 
 RANDOM = Cells(initial="random", seed=3)
 
@@ -156,7 +159,7 @@ def test_wrong_branch_is_there_and_refused(monkeypatch: pytest.MonkeyPatch) -> N
     problem.newton._snes.setLineSearchPreCheck(lambda x, step: False)
     guard = lambda: real() if problem.newton._snes.getConvergedReason() else harmless  # noqa: E731
     monkeypatch.setattr(problem, "evaluate", guard)
-    with pytest.raises(SolveFailure, match=r"reached r/L = 2\.72") as caught:
+    with pytest.raises(SolveFailure, match=r"not admissible: r/L = 2\.72") as caught:
         problem.solve()
     assert (
         problem.newton._snes.getConvergedReason() > 0
@@ -236,7 +239,8 @@ def test_a_newton_step_is_shortened_where_elements_turn_inside_out_or_chains_loc
 
 
 @pytest.mark.parametrize(
-    ("stretch", "said"), [(2.5, "reached r/L = "), (8.0, "reached r/L = "), (-0.5, "J = -0.125")]
+    ("stretch", "said"),
+    [(2.5, "not admissible: r/L = "), (8.0, "not admissible: r/L = "), (-0.5, "J = -0.125")],
 )
 def test_a_start_beyond_the_contour_length_or_inside_out_fails_and_stays(
     stretch: float, said: str
@@ -248,6 +252,24 @@ def test_a_start_beyond_the_contour_length_or_inside_out_fails_and_stays(
     with pytest.raises(SolveFailure, match=said):
         made.problem().solve()
     np.testing.assert_array_equal(made.displacement.x.array, start)
+
+
+@pytest.mark.parametrize("method", ["direct", "lagged"])
+def test_a_solve_that_diverges_ends_early(method: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A thin tube that holds no such pressure, as a large body; it would take 25 iterations, or twice 75."""
+    monkeypatch.setattr(newton, "LARGE", 0)
+    shown: list[str] = []
+    scene = preset_scene("kuhl-holzapfel-2007", "tube").with_values(
+        {"solver.method": method, "geometry.outer_radius": 1.02, "cells.initial": "isotropic"}
+    )
+    with made(scene) as simulation:
+        simulation.state.loading.set({"pressure": 1.0, "elongation": 0.0})
+        simulation.state.tell = shown.append
+        with pytest.raises(SolveFailure, match="the residual diverges") as caught:
+            simulation.stepper.coupling.newton.solve()
+        assert 4 < caught.value.newton_iterations < 25
+        assert len(shown) > caught.value.newton_iterations
+        assert not simulation.unknown.x.array.any()
 
 
 @pytest.mark.parametrize("where", ["displacement", "dimensions", "axes"])
