@@ -528,17 +528,17 @@ class GuardedNewton:
         if not np.isfinite(norm):
             return PETSc.SNES.ConvergedReason.DIVERGED_FNORM_NAN
         present = self._present
-        norms = present.norms
-        present.previous = norms[-1] if norms else np.inf
-        norms.append(norm)
+        residuals = present.norms
+        present.previous = residuals[-1] if residuals else np.inf
+        residuals.append(norm)
         if self.convergence.reached(norm, present.previous):
             return PETSc.SNES.ConvergedReason.CONVERGED_FNORM_ABS
         if present.short_steps >= SHORT_STEPS:
             return PETSc.SNES.ConvergedReason.DIVERGED_LOCAL_MIN
         if (
             self._is_large
-            and len(norms) > DIVERGENCE_WINDOW + 1
-            and norm > max(DIVERGED * norms[0], norms[-1 - DIVERGENCE_WINDOW] / 2)
+            and len(residuals) > DIVERGENCE_WINDOW + 1
+            and norm > max(DIVERGED * residuals[0], residuals[-1 - DIVERGENCE_WINDOW] / 2)
         ):
             return PETSc.SNES.ConvergedReason.DIVERGED_DTOL
         if iteration >= snes.getTolerances()[3] or self.linear.given_up:
