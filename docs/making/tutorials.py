@@ -1,4 +1,4 @@
-"""Outputs and pictures that start and the tutorials show: the pages are run as they stand.
+"""Outputs and pictures of start, the tutorials, fit and howto_ranks: the pages are run as they stand.
 
 About five minutes for all. A block of `output` after a command shows some of its lines, `...` stands for others; their
 numbers are replaced by those of the run. A line that the command does not print ends the script: the page is then to be
@@ -97,7 +97,7 @@ def brought_up_to_date(text: str) -> str:
 def make(keep: bool) -> None:
     """All pages in one folder: they use each other's files. There is nothing to keep."""
     order = re.findall(
-        r"\((tutorial_\w+|fit)\.md\)", (DOCS / "index.md").read_text(encoding="utf-8")
+        r"\((tutorial_\w+|fit|howto_ranks)\.md\)", (DOCS / "index.md").read_text(encoding="utf-8")
     )
     with tempfile.TemporaryDirectory() as folder:
         os.chdir(folder)

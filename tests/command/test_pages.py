@@ -1,4 +1,4 @@
-"""Start, tutorials and how-to pages: each command and each file of a page, in its order, with short times.
+"""Each command and each file of start, tutorials, how-to pages and custom components, with short times.
 
 What a page says that a command prints is compared, all but the numbers. `docs/make tutorials` runs the same pages in
 full and brings numbers and pictures up to date. pages.toml lists the commands that are shown and not run, and why.
@@ -34,6 +34,7 @@ SCRIPT = "import runpy, sys; sys.path.insert(0, '.'); del sys.argv[0]; runpy.run
 PAGES = [
     "start",
     "fit",
+    "architecture",
     *sorted(
         page.stem for kind in ("tutorial", "howto") for page in (ROOT / "docs").glob(f"{kind}_*.md")
     ),
@@ -45,7 +46,7 @@ def blocks(page: str) -> list[tuple[str, str]]:
     text = (ROOT / "docs" / f"{page}.md").read_text(encoding="utf-8")
     for long, short in SHORT.items():
         text = text.replace(long, short)
-    return [(str(language), str(block)) for language, block in BLOCK.findall(text)]
+    return BLOCK.findall(text)
 
 
 def is_left_out(line: str) -> bool:
