@@ -549,9 +549,9 @@ class Lagged(FullNewton):
         )
 
     def fallback(self) -> tuple[str, AbstractContextManager[None]] | None:
-        if self.tangents - self._before >= self.snes.getIterationNumber():
-            return None  # Each iteration had its own tangent already.
-        return "with a new factorisation in every iteration", self._anew()
+        return (
+            None if self._always else ("with a new factorisation in every iteration", self._anew())
+        )
 
     def _costs_more(self, tolerance: float) -> bool:
         """Return whether the remaining iterations cost more than factorising, or diverge."""
