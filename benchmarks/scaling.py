@@ -12,7 +12,7 @@ there are measured again and replaced. Wall time says something on an idle machi
 
 The aorta goes from the surface of its lumen (benchmarks/arch.py) through the commands of a user with
 the program's defaults: a wall of 1.2 mm of triangles of SIZE mm, two load steps of a quarter of 80
-mmHg, `unload`, and 20 steps of remodeling after the load. 250,000 unknowns have a size of 3, 1,000,000
+mmHg, 20 steps of remodeling after the load, and `unload` on one rank. 250,000 unknowns have a size of 3, 1,000,000
 one of 1.5. Its folder is results/aorta-SIZE.
 """
 

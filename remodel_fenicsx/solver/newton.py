@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from functools import partial
 from typing import TypeVar
 
@@ -54,9 +54,8 @@ PRESCRIBED_ROUNDING = 1e-13
 # quasi-Newton solver stopped too early, and some substeps were mistaken for jumps.
 INTERMEDIATE_TOLERANCE = 1e-5
 NEARLY_STRAIGHT = 0.99  # r/L above which the rounding error of one point may dominate
-COARSE = (
-    1e-8  # tolerance / nodal forces; above both limits, the rounding error of one point dominates
-)
+# Tolerance / nodal forces; above both limits, the rounding error of one point dominates.
+COARSE = 1e-8
 # Ratio of two successive residuals above which Newton's method stagnates. A residual that only
 # rounded displacements explain is accepted only then; with nearly straight chains, so is one that
 # only rounded stresses explain.
@@ -206,8 +205,8 @@ class _Solve:
 
     step_start: Array  # unknowns at the start of the step
     first_iterate: float | None = None  # its distance from the start of the step
-    norms: list[float] = field(default_factory=list)  # of the residual in each iteration
-    previous: float = np.inf  # last norm but one
+    norm: float = np.inf
+    previous: float = np.inf
     inadmissible: bool = False  # also on a request to stop
     # All states whose |dF| from the present iterate is below this are admissible.
     safe_change: float = 0.0
@@ -283,7 +282,7 @@ class GuardedNewton:
         snes: PETSc.SNES = PETSc.SNES().create(equilibrium.comm)
         snes.setFunction(self._assemble_residual, self._residual)
         snes.setJacobian(
-            lambda *_: self.linear.tangent(self._present.norms[-1], self.convergence.goal()),
+            lambda *_: self.linear.tangent(self._present.norm, self.convergence.goal()),
             self._matrix,
         )
         snes.setLineSearchPreCheck(self._keep_admissible)
@@ -292,9 +291,9 @@ class GuardedNewton:
         # A PETSc option of the user may have changed it.
         self._most_iterations = snes.getTolerances()[3]
         snes.setConvergenceTest(self._converged)
-        self._is_large = unknowns > LARGE
-        if self._is_large:
+        if unknowns > LARGE:
             snes.setMonitor(self._show)
+            snes.setConvergenceHistory(reset=True)
         self._snes: PETSc.SNES = snes
         self.linear: FullNewton = SOLVER_METHODS[method].make_linear(
             equilibrium, snes, self._matrix, self._options
@@ -528,17 +527,14 @@ class GuardedNewton:
         if not np.isfinite(norm):
             return PETSc.SNES.ConvergedReason.DIVERGED_FNORM_NAN
         present = self._present
-        residuals = present.norms
-        present.previous = residuals[-1] if residuals else np.inf
-        residuals.append(norm)
+        present.previous, present.norm = present.norm if iteration else np.inf, norm
         if self.convergence.reached(norm, present.previous):
             return PETSc.SNES.ConvergedReason.CONVERGED_FNORM_ABS
         if present.short_steps >= SHORT_STEPS:
             return PETSc.SNES.ConvergedReason.DIVERGED_LOCAL_MIN
-        if (
-            self._is_large
-            and len(residuals) > DIVERGENCE_WINDOW + 1
-            and norm > max(DIVERGED * residuals[0], residuals[-1 - DIVERGENCE_WINDOW] / 2)
+        residuals, _ = snes.getConvergenceHistory()  # recorded for large bodies alone
+        if len(residuals) > DIVERGENCE_WINDOW + 1 and norm > max(
+            DIVERGED * residuals[0], residuals[-1 - DIVERGENCE_WINDOW] / 2
         ):
             return PETSc.SNES.ConvergedReason.DIVERGED_DTOL
         if iteration >= snes.getTolerances()[3] or self.linear.given_up:

@@ -256,7 +256,7 @@ def test_a_start_beyond_the_contour_length_or_inside_out_fails_and_stays(
 
 @pytest.mark.parametrize("method", ["direct", "lagged"])
 def test_a_solve_that_diverges_ends_early(method: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    """A thin tube that holds no such pressure, as a large body; it would take 25 iterations, or twice 75."""
+    """A thin tube, as a large body: its residual goes far above the first one. A small body may go on from there."""
     monkeypatch.setattr(newton, "LARGE", 0)
     shown: list[str] = []
     scene = preset_scene("kuhl-holzapfel-2007", "tube").with_values(
