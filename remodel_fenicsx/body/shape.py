@@ -190,7 +190,7 @@ def columns_of_region(name: str) -> tuple[Column, Column]:
 # ---------------------------------------------------------------- columns of a history
 def _of_work(name: str, meaning: str) -> Column:
     """Return a column of the solver's work in the step."""
-    return Column(name, "", meaning, lambda m: getattr(m.step.work, name), by_case=False)
+    return Column(name, "", meaning, attrgetter(f"step.work.{name}"), by_case=False)
 
 
 FIRST_COLUMN = Column("time", "time", "time of the scene", lambda m: m.step.time, by_case=False)
@@ -1061,6 +1061,11 @@ def mean_component(tensor: Measure[Array], name: str) -> Measure[float]:
         return float(m.quadrature.mean(values[..., row, column]))
 
     return mean
+
+
+def mean_over(mean: Callable[..., float], values: Measure[Array]) -> Measure[float]:
+    """Return a mean, such as that over the elements at a face, of values at the points."""
+    return lambda m: mean(m, values(m))
 
 
 def homogeneous_bar(

@@ -7,6 +7,7 @@ import itertools
 from abc import abstractmethod
 from collections.abc import Callable, Collection, Mapping
 from functools import partial
+from operator import attrgetter
 from typing import Any, ClassVar, NamedTuple, TYPE_CHECKING
 
 import numpy as np
@@ -20,6 +21,7 @@ from remodel_fenicsx.body.shape import (
     Unloads,
     WithAxes,
     WithRegions,
+    mean_over,
 )
 from remodel_fenicsx.model.axes import LocalAxes
 from remodel_fenicsx.model.cells import pitch_angle, radial_fraction
@@ -184,7 +186,7 @@ def angle_columns(means: Mapping[str, tuple[str, AngleOf]], configuration: str =
                 if configuration
                 else f"{ANGLE_IN} {words}"
             ),
-            lambda m, mean=mean: mean(m, getattr(m, name)),  # type: ignore[misc]
+            mean_over(mean, attrgetter(name)),
             by_case=bool(configuration),
         )
         for where, (words, mean) in means.items()

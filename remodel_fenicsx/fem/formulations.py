@@ -238,7 +238,10 @@ class _SplitFormulation(DiscreteFormulation):
         self.quadrature.values(self.jacobian, ())[:] = self.jacobians() @ self._interpolation.T
 
     def jacobians(self) -> Array:
-        return self._expression.eval(self.quadrature.mesh, self.quadrature.elements)[..., 0]
+        from remodel_fenicsx.fem.quadrature import point_values
+
+        rule, points = self.quadrature, self._interpolation.shape[1]
+        return point_values(self._expression, rule.mesh, rule.elements, points)[..., 0]
 
 
 NOT_LOCKING = "selective-integration"

@@ -37,7 +37,6 @@ from remodel_fenicsx.system.interrupts import held_back, raise_on_signal
 from remodel_fenicsx.system import NOTICE
 
 if TYPE_CHECKING:
-    from dolfinx.mesh import Mesh
     from ufl import Form
     from ufl.core.expr import Expr
 
@@ -171,13 +170,19 @@ def expression(
     ufl_expression: Expr,
     points: NDArray[np.float64],
     name: str | None = None,
-) -> PointValues:
-    """Compile a UFL expression for evaluation at reference points, (n, 3). See `form`."""
+) -> list[dolfinx.fem.Expression]:
+    """Compile a UFL expression for evaluation at reference points, (n, 3). See `form`.
+
+    Returns
+    -------
+    list of Expression
+        Vectors of components in the expression's order; `quadrature.point_values` evaluates them.
+    """
     flat = [
         ufl_expression[place] if place else ufl_expression
         for place in np.ndindex(ufl_expression.ufl_shape)
     ]
-    parts, sizes = [], []
+    parts = []
     comm = extract_unique_domain(ufl_expression).ufl_cargo().comm
     while flat:
         size = next(size for size in SIMD_COMPONENTS if size <= len(flat))
@@ -185,25 +190,7 @@ def expression(
         with _compiler_watched(comm, name or "an expression", 1):
             own = map_expr_dag(_OwnLabels(), part)
             parts.append(dolfinx.fem.Expression(own, points, jit_options=jit_options()))
-            sizes.append(size)
-    return PointValues(parts, sizes, len(points))
-
-
-class PointValues:
-    """Compiled expression at reference points of elements, in kernels of some components each."""
-
-    def __init__(self, parts: list[dolfinx.fem.Expression], sizes: list[int], points: int):
-        self._parts, self._sizes = parts, sizes
-        self._points = points
-        self.components = sum(sizes)
-
-    def eval(self, mesh: Mesh, elements: NDArray[np.int32]) -> NDArray[np.float64]:
-        """Return the components at the points of each element, (elements, points, components)."""
-        values = [
-            part.eval(mesh, elements).reshape(len(elements), self._points, size)
-            for part, size in zip(self._parts, self._sizes, strict=True)
-        ]
-        return values[0] if len(values) == 1 else np.concatenate(values, axis=2)
+    return parts
 
 
 def library(

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from functools import cached_property
 from typing import Any, TYPE_CHECKING
 
@@ -43,6 +44,20 @@ def shape_functions(kind: str, degree: int, points: NDArray[np.float64]) -> NDAr
         family, basix.CellType[kind], degree, variant, discontinuous=degree == 0
     )
     return np.asarray(element.tabulate(1, points))[..., 0]
+
+
+def point_values(
+    expression: Sequence[dolfinx.fem.Expression],
+    mesh: Mesh,
+    elements: NDArray[np.int32],
+    points: int,
+) -> NDArray[np.float64]:
+    """Evaluate a compiled expression (`jit.expression`), (elements, points, components)."""
+    values = [
+        part.eval(mesh, elements).reshape(len(elements), points, *part.ufl_expression.ufl_shape)
+        for part in expression
+    ]
+    return values[0] if len(values) == 1 else np.concatenate(values, axis=2)
 
 
 @with_old_names
@@ -160,11 +175,12 @@ class Quadrature:
 
     def evaluate(
         self,
-        expression: jit.PointValues,
+        expression: Sequence[dolfinx.fem.Expression],
         value_shape: tuple[int, ...],
     ) -> NDArray[np.float64]:
         """Evaluate a compiled expression at the points, ``(elements, points, *value_shape)``."""
-        return expression.eval(self.mesh, self.elements).reshape(*self.shape, *value_shape)
+        values = point_values(expression, self.mesh, self.elements, self.shape[1])
+        return values.reshape(*self.shape, *value_shape)
 
     def owned(self, values: NDArray[Any]) -> NDArray[Any]:
         """Return the rows of the elements that this rank owns, (owned elements, ...)."""

@@ -180,7 +180,7 @@ class Measurement:
         return self._cauchy_stress()
 
     def _cauchy_stress(self, of_collagen: bool = False) -> Array:
-        def compiled() -> tuple[PointStresses, jit.PointValues]:
+        def compiled() -> tuple[PointStresses, list[dolfinx.fem.Expression]]:
             stresses = PointStresses(self.state, self.observer.stepper.tissue)
             part = stresses.ufl.collagen if of_collagen else stresses.ufl
             assert part is not None

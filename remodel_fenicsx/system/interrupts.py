@@ -30,6 +30,10 @@ PAUSE = signal.SIGUSR1
 # seconds to wait for a repeated signal: `timeout`, for one, signals the process and then its group
 _ONE_SIGNAL = 0.2
 
+# Raises the exception of a signal again that was lost: Python ignores exceptions in finalisers, and
+# libraries in C and in imports ignore any. Without a handler this signal does nothing.
+_AGAIN = signal.SIGURG
+
 # Signals on which PETSc aborts, including some that a run survives: a closed pipe, and the hangup
 # that nohup ignores.
 _NOT_PETSCS = (
@@ -59,6 +63,10 @@ class Interrupted(RemodelError):  # noqa: N818 - no error: a user has stopped th
     def in_words(self) -> str:
         """Describe the signal and what is saved, on one line."""
         return f"stopped by {self}; {self.kept}"
+
+
+class _Signal(BaseException):
+    """Signal that a handler raises; like KeyboardInterrupt no Exception, which libraries catch."""
 
 
 class Paused(RemodelError):  # noqa: N818 - no error: a user has stopped the run
@@ -242,21 +250,17 @@ class StopRequest:
             if os.environ.get("OMPI_COMM_WORLD_SIZE", "1") == "1":
                 clock.sleep(_ONE_SIGNAL)
             signal.signal(number, signal.SIG_DFL)
-            if self.raises:
-                raise Interrupted(number, on_all_ranks=False)
+            self.raise_again()
 
-    def _send_again(
-        self, hook: Callable[[sys.UnraisableHookArgs], object], lost: sys.UnraisableHookArgs
-    ) -> None:
-        """Send a signal again whose exception Python has ignored, as it does in finalisers."""
-        if not isinstance(lost.exc_value, Interrupted):
-            hook(lost)
-            return
-        number, self.number = self.number, 0
-        signal.signal(number, self._remember)
-        main = threading.main_thread().ident
-        # Later, because the hook runs in the finaliser, too.
-        threading.Timer(_ONE_SIGNAL, signal.pthread_kill, (main, number)).start()
+    def raise_again(self, *_: object) -> None:
+        """Raise while the block of `raise_on_signal` runs, now and after each interval."""
+        if self.number and self.raises:
+            main = threading.main_thread().ident
+            again = threading.Timer(_ONE_SIGNAL, signal.pthread_kill, (main, _AGAIN))
+            again.daemon = True
+            again.start()
+            if not isinstance(sys.exception(), (_Signal, Interrupted)):  # It was lost.
+                raise _Signal
 
     def __exit__(self, *error: object) -> None:
         _requests.remove(self)
@@ -276,8 +280,20 @@ def raise_on_signal() -> Iterator[None]:
     if request.number:
         raise Interrupted(request.number, on_all_ranks=False)
     before, request.raises = request.raises, True
-    hook, sys.unraisablehook = sys.unraisablehook, partial(request._send_again, sys.unraisablehook)
+    hook, sys.unraisablehook = sys.unraisablehook, partial(
+        _report_unless_signal, sys.unraisablehook
+    )
     try:
-        yield
+        with handled(request.raise_again, [_AGAIN], lambda _: True):
+            yield
+    except _Signal:
+        raise Interrupted(request.number, on_all_ranks=False) from None
     finally:
         request.raises, sys.unraisablehook = before, hook
+
+
+def _report_unless_signal(
+    report: Callable[[sys.UnraisableHookArgs], object], lost: sys.UnraisableHookArgs
+) -> None:
+    if not isinstance(lost.exc_value, _Signal):
+        report(lost)
