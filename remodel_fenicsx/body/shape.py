@@ -531,7 +531,7 @@ _Is: Any = with_key(
     default="unloaded",
     description="State of the geometry: without loads, or (tube, user-supplied body) under the "
     "loads at the end of their ramps; the unloaded body is then computed "
-    "(docs/turnover.md).",
+    "(docs/load_cases.md).",
 )
 
 

@@ -776,7 +776,7 @@ class Remodeling(Table):
     mean: Annotated[str, OneOf(MEANS_OF_CASES)] = Field(
         default="tensor",
         description="Mean over several load cases ([[cases]]) that the cells follow. "
-        f"{meanings(MEANS_OF_CASES)} (docs/turnover.md, Load cases).",
+        f"{meanings(MEANS_OF_CASES)} (docs/load_cases.md, Load cases).",
     )
     rotation_time: float = Field(default=40.0, gt=0)
     """For the law 'rotation': a small angle between fibre and tension decays as exp(-t /
@@ -1055,7 +1055,7 @@ SUM_OF_WEIGHTS = 1e-9  # tolerance for the sum of case weights: rounding, and 1/
 
 
 class LoadCase(Table):
-    """Load case of a cycle, such as diastole: fraction of the time, and loads (docs/turnover.md).
+    """Load case of a cycle, such as diastole: fraction of the time, and loads (docs/load_cases.md).
 
     Every case is a state of its own, solved with the same cells. The cells follow a mean over the
     cases. The columns and fields of a run are those of the first case. The further cases have

@@ -61,7 +61,7 @@ def artery(
 
 
 def rest(cases: Any = (), **changes: Any) -> np.ndarray:
-    """Angles inside, half-way and outside, once the cells rest; by itself of the tissue of docs/turnover.md."""
+    """Angles inside, half-way and outside, once the cells rest; by itself of the tissue of docs/load_cases.md."""
     tables = {"time": {"end": 396.0, "step": 12.0}, "material": {"repulsion": "length"}} | changes
     row = last_row(artery(cases, columns=ANGLES, **tables))
     return np.array([row[name] for name in ANGLES])
@@ -168,7 +168,7 @@ def test_which_case_is_first_changes_no_cell() -> None:
 
 
 def test_a_pulse_is_seen_as_its_mean() -> None:
-    """The figures of docs/turnover.md: a normal pulse does not count, axial excursions and the largest tension do."""
+    """The figures of docs/load_cases.md: a normal pulse does not count, axial excursions and the largest tension do."""
     mean = rest_of_the_mean()
     assert rest(pulse(0.1))[1] - mean[1] == pytest.approx(0.6, abs=0.3)
     assert rest(pulse(0.33))[1] - mean[1] == pytest.approx(6.1, abs=1.0)

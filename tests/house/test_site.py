@@ -37,7 +37,7 @@ BEST = {  # where a reader wants to be
     "mmHg": "tutorial_tube",
     "resume": "howto_ranks",
     "STL": "my_own_vessel",
-    "systole": "turnover",
+    "systole": "load_cases",
 }
 
 
