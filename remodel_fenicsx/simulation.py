@@ -249,7 +249,7 @@ def _time_stepping(scene: Scene, stepper: Stepper) -> TimeStepping:
 
 
 def watchers(scene: Scene, parts: SimulationParts) -> list[Watcher]:
-    """Return the watchers in order: for each load case, eigenvalues before the warnings."""
+    """Return the watchers in order; each load case checks its stability before its warnings."""
     stepper, unstable = parts.stepper, scene.solver.unstable
     counted = "negative_eigenvalues" in scene.output.columns
     candidates: list[Watcher | None] = [

@@ -133,8 +133,8 @@ class Traits(NamedTuple):
     order
         Order of the error in the step size.
     accumulates
-        Whether the errors of steps accumulate. Otherwise only the cells have an error: they are
-        one step old.
+        True if the errors of all steps add up; False if the only error is a delay of the cells and
+        of other remodeling processes by one step.
     max_scaled_step
         Largest adaptive step times kappa; an explicit rule oscillates with larger steps.
 
@@ -301,7 +301,8 @@ class Staggered:
         before = unknown.x.array.copy()
         step = LoadStep.between(time - state.time, old_loads, loads)
         self._solve(step, time, old_loads, loads, work, again)
-        # To detect a jump, cells and loads change together, in substeps from `before`.
+        # If the solution may be on another branch, the step is repeated from `before` in substeps
+        # that change cells and loads together.
         self._combined_change(time, old_loads, loads).check_for_jump(before, work, again)
         if self.predictor is not None:
             self.predictor.solved(step, before, again)
@@ -325,7 +326,7 @@ class Staggered:
 
     @property
     def higher_order_cells(self) -> UnitCell | None:
-        """Cells after a full pass with the row's stress; the row's cells lag behind by a step."""
+        """Cells after an unrelaxed pass with the solved stress; the row has those before it."""
         return self.remodeling.full_pass_cells
 
     def close(self) -> None:
@@ -480,8 +481,9 @@ def between(old: LoadValues, new: LoadValues, fraction: float) -> LoadValues:
 class Extrapolated(Staggered):
     """Second-order coupling: remodel with an extrapolated target, then solve."""
 
-    # The target sE (switch s, direction E) is extrapolated from the last two steps to the middle of
-    # the step of size h, sE + h/2 d(sE)/dt. See docs/time_integration.md, Extrapolated coupling.
+    # A `Target` is the tensor T that A/r0^2 approaches and the switch s of its rate. Their product
+    # is extrapolated from the last two steps to the middle of this step of size h: s T + h/2
+    # d(s T)/dt. See docs/time_integration.md, Extrapolated coupling.
 
     traits = Traits(order=2, accumulates=True, max_scaled_step=0.5)
 
@@ -551,7 +553,7 @@ class Extrapolated(Staggered):
         return target_from_records(self._newest).towards(target_from_records(self._older), -weight)
 
     def _set_cells_after(self, target: Target, time: float) -> None:
-        """Set the cells after the step; use the last target if A would become indefinite."""
+        """Set the cells of the step's end; use the last target where A would become indefinite."""
         duration = time - self.state.time
         self._power = 0.0
         if not count_points(self.state, target.switch != 0.0):

@@ -85,8 +85,8 @@ class Remodels:
         time
             End of the step.
         order
-            Order of the coupling: for 1 the last rates apply to the step, for 2 rates that are
-            extrapolated to its middle.
+            Order of the coupling. For 1 the values follow one step late, by the last rates and the
+            last duration; for 2 by rates that are extrapolated to the middle of this step.
         """
 
     def settle(self, time: float, again: bool) -> Work:

@@ -58,7 +58,7 @@ LOOSE_SOLVER = (
 
 
 class Noise(NamedTuple):
-    """Error bound of a principal value, and a stress's rounding, in the tensor's unit."""
+    """Error bounds of principal values of the driving tensor: in total, and by rounding alone."""
 
     size: float
     rounding: float
@@ -159,7 +159,7 @@ class RemodelingPass(Remodels):
         F, tensor = self.driving_tensor()
         noise, rounding = self.noise(F, tensor, residual)
         cells = self.state.cells
-        # Principal axes of the driver with which the axes of the cells do not change.
+        # If the driver has these principal axes, the cells do not rotate.
         steady = cells.point_cells.axes
         if not self.driver.material and self.frame.carries_axes:
             steady = convected_axes(F, steady)
@@ -287,8 +287,8 @@ class RemodelingPass(Remodels):
     def apply(self, time_old: float, time_new: float, residual: float = 0.0) -> float:
         """Remodel over a step with the stress of the solved state at time_new; return the power."""
         # The power is the stored energy that the pass releases at frozen deformation, per time, to
-        # first order (`Tissue.energy_increment`; Remark 6). A principal stress above `noise` counts
-        # as tension. The factor `relaxation` applies to the change of the cells (`Law.relax`).
+        # first order (`Tissue.energy_increment`; Remark 6). The factor `relaxation` applies to the
+        # change of the cells (`Law.relax`).
         full_pass, F = self.updated_cells(time_old, time_new, residual)
         return self.replace(full_pass, F, time_new - time_old, self.relaxation)
 
@@ -371,7 +371,7 @@ class RemodelingPass(Remodels):
         return self.quadrature.maximum(np.linalg.norm(change, axis=(-1, -2)) / r0**2)
 
     def apply_change(self, change: Array, factor: float, time: float, residual: float) -> None:
-        """Apply a multiple of a new pass, which also changes the points without tension."""
+        """Apply a multiple of a new pass, because `change` lacks points without tension."""
         remodeled, _ = self.updated_cells(self.state.time, time, residual)
         cells = self.state.cells
         self.set(relaxed(cells.point_cells.copy(), remodeled, factor))

@@ -41,7 +41,8 @@ log = logging.getLogger(__name__)
 CHECK_INTERVAL = 5
 
 
-@partial(with_old_names, arguments=False)  # no old argument names: only steppers make steps
+# Users do not create steps, so that the arguments need no deprecated names.
+@partial(with_old_names, arguments=False)
 @dataclass
 class Step:
     """Record of a time step, filled between the solution and the end of the step.
@@ -353,7 +354,7 @@ class Stepper(LoadCaseSolver):
         self.tissue = state.parameters(tissue).tissue
         self.remodeling = RemodelingPass(state, self.tissue, remodeling, kappa, processes)
         self.load_cases = [self]
-        # For cells that never change the cheapest coupling is enough.
+        # If the cells never change, the cheapest coupling replaces that of the scene.
         name = remodeling.coupling if self.remodeling.law.remodels else "staggered"
         if processes and not coupling and name != remodeling.coupling and state.comm.rank == 0:
             log.warning(
@@ -481,7 +482,7 @@ class Stepper(LoadCaseSolver):
             limits = work.limits or self.coupling.equilibrium.limits()
             if rejected is not None:
                 work.add(rejected.work)
-            loads = dict(state.loading.values)  # also loads that `load_values` leaves unchanged
+            loads = dict(state.loading.values)  # also those that `load_values` omits
             step = Step(time, state.number + 1, loads, limits, work, is_last=is_last)
             with notify_undone(watchers, step):
                 for watcher in watchers:

@@ -187,8 +187,8 @@ class TurnoverPass(Remodels):
     # ------------------------------------------------------------ over a step
     def before(self, time: float, order: int) -> None:
         """Change m and rho before the step is solved."""
-        # Order 1: the last rates apply over the last step. Order 2: over this step, with
-        # rates that are extrapolated to its middle.
+        # Order 1: m and rho follow one step late, with the last rates and duration.
+        # Order 2: with the duration of this step, and rates extrapolated to its middle.
         duration, last = time - self.state.time, self._numbers["duration"]
         rates = self.rates()
         self._numbers["duration"], self._start_rates = duration, None

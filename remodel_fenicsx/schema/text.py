@@ -249,7 +249,8 @@ def read_columns(
         cells = table[:, names.index(header)]
         table = table[[cell in values or _number(cell, mark) in values for cell in cells]]
     if not len(table):
-        raise UnreadableFile(f"has no row of numbers with {chosen}")
+        rule = " and ".join(f"{header!r} in {values}" for header, values in chosen.items())
+        raise UnreadableFile(f"has no row of numbers with {rule}")
     columns = {
         head[place]: _numbers(
             [str(cell) for cell in table[:, place]], head[place], mark, head[place] == labels

@@ -49,16 +49,15 @@ ROUNDED_STRAINS = 8.0
 PRESCRIBED_TOLERANCE = 1e-10
 # Gap below which prescribed values count as met, relative to the body's size.
 PRESCRIBED_ROUNDING = 1e-13
-# Residual of all substeps but the last, relative to the nodal forces. Jump detection compares the
-# displacements of successive substeps, which may be as short as 1/256 of a step. With 1e-3 the
-# quasi-Newton solver stopped too early, and some substeps were mistaken for jumps.
+# Residual at which a substep of a change of the cells ends, relative to the nodal forces; the last
+# substep has the full tolerance. Jump detection compares the displacements of successive substeps.
+# With 1e-3 the quasi-Newton solver stopped too early, and some substeps were mistaken for jumps.
 INTERMEDIATE_TOLERANCE = 1e-5
 NEARLY_STRAIGHT = 0.99  # r/L above which the rounding error of one point may dominate
-# Tolerance / nodal forces; above both limits, the rounding error of one point dominates.
+# Ratio of tolerance and nodal forces above which, if also r/L > NEARLY_STRAIGHT, the rounding error
+# of one point may dominate the tolerance.
 COARSE = 1e-8
-# Ratio of two successive residuals above which Newton's method stagnates. A residual that only
-# rounded displacements explain is accepted only then; with nearly straight chains, so is one that
-# only rounded stresses explain.
+# Newton's method stagnates if a residual exceeds this fraction of the residual before it.
 STAGNATION = 0.25
 
 
@@ -70,9 +69,8 @@ class Convergence:
         quadrature = equilibrium.quadrature
         areas, gradients = quadrature.largest_areas, quadrature.gradients
         self._area = quadrature.norm(areas)
-        self._area_times_gradient = quadrature.norm(
-            areas * gradients
-        )  # times stress and displacement: a force
+        # A force, if it is multiplied by a stress and a displacement.
+        self._area_times_gradient = quadrature.norm(areas * gradients)
         self.force_scale = self.max_chain_extension = self.displacement = 0.0
         self.prescribed_gap, self.intermediate = float("inf"), False
         self.begin()
@@ -90,9 +88,9 @@ class Convergence:
     def reached(self, norm: float, previous: float) -> bool:
         """Return whether a residual norm is accepted; `previous`: the norm before, or infinity."""
         # The rounding error is computed for the largest r/L and the largest displacement of the
-        # body. Near L it may be far above the rounding error of most points. A residual that
-        # only this error allows is then (`coarse`) accepted only if Newton's method stagnates;
-        # otherwise that holds for rounded displacements alone.
+        # body. Near L it may be far above the rounding error of most points. If so (`coarse`), a
+        # residual above the requested tolerance is accepted only if Newton's method stagnates.
+        # Otherwise this condition applies only to the error of rounded displacements.
         if self.prescribed_gap > PRESCRIBED_TOLERANCE:
             return False
         if self.intermediate and norm <= INTERMEDIATE_TOLERANCE * self.force_scale:
@@ -137,10 +135,10 @@ LINE_SEARCH_HALVINGS = 20  # number of halvings of a Newton step before the line
 # Number of Newton steps in a row, and of halvings of each, after which a solve fails. Solves that
 # succeed have at most two such steps; on a thin wall under too much load all steps are that short.
 SHORT_STEPS, SHORT_STEP_HALVINGS = 4, 6
-# A solve of a large body diverges if its residual exceeds DIVERGED times the first one and has not
-# halved within DIVERGENCE_WINDOW iterations after the first. Without this limit, the first load
-# step of an aorta fails after 13 iterations at 13 times, each with a factorisation. Small bodies
-# may take all iterations, because some succeed after such a residual.
+# A solve of a large body diverges if its residual exceeds DIVERGED times the first one, and half of
+# the residual DIVERGENCE_WINDOW iterations before. Without this limit, the first load step of an
+# aorta fails after 13 iterations with a residual 13 times the first one; each iteration has a
+# factorisation. Small bodies may take all iterations, because some succeed after such a residual.
 DIVERGED, DIVERGENCE_WINDOW = 3.0, 4
 # Smallest displacement of a jump, relative to the body's size; for a tube ten radii long this is
 # 1 % of its radius.
@@ -387,10 +385,10 @@ class GuardedNewton:
         return float(np.sqrt(allreduce(self.equilibrium.comm, float(change @ change), MPI.SUM)))
 
     def newton_correction(self, equilibrium: Equilibrium, tangents: int) -> Array:
-        """Return the Newton step for `equilibrium`. Collective.
+        """Return the Newton step for the residual of `equilibrium`. Collective.
 
-        `tangents`: number of tangents assembled for this state; if 0, one is assembled. A method
-        that reuses factorisations assembles one only if it has none yet.
+        The tangent is the last one. If `tangents`, the number that was assembled for this state, is
+        0, it is assembled here, unless the method reuses a factorisation.
         """
         self._to_petsc(self._x)
         equilibrium.assemble_internal(self._residual)
@@ -522,7 +520,7 @@ class GuardedNewton:
     def _converged(
         self, snes: PETSc.SNES, iteration: int, norms: tuple[float, float, float]
     ) -> int:
-        """Return the SNES reason after an iteration, from `Convergence` and the iteration limit."""
+        """Return whether the solve converged, failed (and why), or continues, as a SNES reason."""
         norm = norms[2]
         if not np.isfinite(norm):
             return PETSc.SNES.ConvergedReason.DIVERGED_FNORM_NAN
