@@ -20,11 +20,11 @@ ALL = "**all**"
 MEANINGS = {
     "right": "every row is within the tolerance of the reference",
     "refused": "exit code 2 or 3",
-    "unstable": "the equilibrium is no minimum of the energy, and the run warns of it",
-    "warned": "an error above the tolerance, with a warning during the run",
-    "wrong": "an error above the tolerance or an unstable equilibrium, without a warning",
-    "unchecked": "the reference has no answer, or 120 s of CPU time were not enough",
-    "false alarms": "right, with a warning; counted above too",
+    "unstable": "an unstable equilibrium, of which the run warns",
+    "warned": "an error above the tolerance, with a warning",
+    "wrong": "the same as unstable or warned, without a warning",
+    "unchecked": "no reference, or more than 120 s of CPU time",
+    "false alarms": "right cases with a warning",
 }
 
 
