@@ -2,7 +2,7 @@
 """How time and memory grow with the body: the artery on finer meshes, on one rank and on two.
 
     ./with-fenicsx benchmarks/scaling.py [--unknowns N]... [--ranks N]... [--steps 3] [--method auto]    # measures
-    ./with-fenicsx benchmarks/scaling.py --report       # the table (docs/speed_and_accuracy.md)
+    ./with-fenicsx benchmarks/scaling.py --report       # the table (docs/reliability.md)
     ./with-fenicsx benchmarks/scaling.py --aorta SIZE [--ranks N]    # an arch with three branches
 
 Each case is a run of its own (the paper's tube, random cells, no fields, predictor on) with the mesh whose number of

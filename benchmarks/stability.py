@@ -2,9 +2,9 @@
 """Where the method holds: several hundred cases at the extremes, each held against a reference that shares no code.
 
     ./with-fenicsx benchmarks/stability.py [--family NAME]... [--only TEXT]... [--again] [--jobs N] [--limit SECONDS]
-    ./with-fenicsx benchmarks/stability.py --report         # docs/what_may_go_wrong.md from what has been measured
+    ./with-fenicsx benchmarks/stability.py --report         # docs/reliability.md from what has been measured
 
-A case ends as right, refused, unstable, warned, wrong or unchecked (docs/what_may_go_wrong.md says what each means).
+A case ends as right, refused, unstable, warned, wrong or unchecked (docs/reliability.md says what each means).
 Each result is one line of results/stability/VERSION.jsonl. What is there is not run again: a run that was stopped
 goes on where it was. Results belong to the package as it was; another commit has benchmarks of its own.
 """

@@ -29,7 +29,7 @@ def main(description: str | None, arguments: list[str] | None = None) -> int:
     parser.add_argument(
         "--report",
         action="store_true",
-        help="write table and picture of docs/what_may_go_wrong.md, run nothing",
+        help="write table and picture of docs/reliability.md, run nothing",
     )
     options = parser.parse_args(arguments)
     if options.report:

@@ -1,4 +1,4 @@
-"""The table and the picture of docs/what_may_go_wrong.md, and what is said of cases, from what has been measured."""
+"""The table and the picture of docs/reliability.md, and what is said of cases, from what has been measured."""
 
 from __future__ import annotations
 
@@ -14,8 +14,18 @@ from benchmarks.stability_map.judging import OUTCOMES
 from benchmarks.stability_map.running import Record, digest, read_records
 from docs.making.pages import DOCS, FIGURES, between_marks, markdown
 
-PAGE = DOCS / "what_may_go_wrong.md"
+PAGE = DOCS / "reliability.md"
 EXTRA = ("false alarms", "refused, no cause")
+ALL = "**all**"
+MEANINGS = {
+    "right": "every row is within the tolerance of the reference",
+    "refused": "exit code 2 or 3",
+    "unstable": "an unstable equilibrium, of which the run warns",
+    "warned": "an error above the tolerance, with a warning",
+    "wrong": "the same as unstable or warned, without a warning",
+    "unchecked": "no reference, or more than 120 s of CPU time",
+    "false alarms": "right cases with a warning",
+}
 
 
 # ---------------------------------------------------------------- tables
@@ -27,18 +37,13 @@ def counts(records: Iterable[Record]) -> dict[str, Counter[str]]:
         row[record["outcome"]] += 1
         row["false alarms"] += bool(record["false_alarm"])
         row["refused, no cause"] += record["cause_named"] is False
-    rows["**all**"] = sum(rows.values(), Counter())
+    rows[ALL] = sum(rows.values(), Counter())
     return rows
 
 
-def table(records: Iterable[Record]) -> str:
-    """Outcomes by family, those without a blemish in one row; columns that are not empty, and `wrong` in any case."""
-    rows = counts(records)
-    total = rows.pop("**all**")
-    plain = [name for name, row in rows.items() if not sum(row.values()) - row["right"]]
-    rows[f"{len(plain)} other families"] = sum(map(rows.pop, plain), Counter())
-    rows["**all**"] = total
-    columns = [name for name in (*OUTCOMES, *EXTRA) if rows["**all**"][name] or name == "wrong"]
+def table(rows: Mapping[str, Counter[str]]) -> str:
+    """Outcomes of each row; columns that are not empty, and `wrong` in any case."""
+    columns = [name for name in (*OUTCOMES, *EXTRA) if rows[ALL][name] or name == "wrong"]
     cells = (
         [
             name,
@@ -127,11 +132,14 @@ def write(results: Path, cases: Mapping[str, Case], source: str) -> int:
         print(f"nothing has been measured with {source}: run benchmarks/stability.py first")
         return 1
     draw(FIGURES / "stability.png", cases, records)
-    families = f"{table(records)}\n\n{made(source, records, cases)}"
+    rows = counts(records)
+    totals = ([name, str(rows[ALL][name]), meaning] for name, meaning in MEANINGS.items())
+    outcomes = markdown(["outcome", "cases", "meaning"], totals)
+    families = f"{outcomes}\n\n{made(source, records, cases)}"
     PAGE.write_text(
         between_marks(PAGE.read_text(encoding="utf-8"), "families", families), encoding="utf-8"
     )
-    parts = []
+    parts = [f"# families\n\n{table(rows)}"]
     for outcome in ("wrong", "warned", "unchecked"):
         said = listed(records, cases, lambda r, outcome=outcome: r["outcome"] == outcome)  # type: ignore[misc]
         parts.append(f"# {outcome}\n\n{said}")

@@ -1,4 +1,4 @@
-"""docs/interface.md, the list of everything that is public, and the table of columns in docs/commands.md.
+"""docs/interface.md, the list of everything that is public, and the tables of docs/commands.md.
 
 A change of the interface is a change of that page: `./with-fenicsx docs/make interface`, and CHANGELOG.md says so.
 """
@@ -186,23 +186,59 @@ class _Default:
 
 
 # ---------------------------------------------------------------- the rest
-def _commands(parser: argparse.ArgumentParser) -> Iterator[str]:
+def _parsers(parser: argparse.ArgumentParser) -> dict[str, argparse.ArgumentParser]:
+    """Commands with a help text."""
     (commands,) = (
         action for action in parser._actions if isinstance(action, argparse._SubParsersAction)
     )
+    return {listed.dest: commands.choices[listed.dest] for listed in commands._choices_actions}
+
+
+def _commands(parser: argparse.ArgumentParser) -> Iterator[str]:
     yield " ".join([parser.prog, *_arguments(parser)])
-    for listed in commands._choices_actions:  # those with a help text
-        yield " ".join([parser.prog, listed.dest, *_arguments(commands.choices[listed.dest])])
+    for name, found in _parsers(parser).items():
+        yield " ".join([parser.prog, name, *_arguments(found)])
+
+
+def _listed(parser: argparse.ArgumentParser) -> list[argparse.Action]:
+    hidden = (argparse._HelpAction, argparse._SubParsersAction)
+    return [action for action in parser._actions if not isinstance(action, hidden)]
+
+
+def _label(action: argparse.Action) -> str:
+    """Names and value."""
+    choices = f"{{{','.join(map(str, action.choices))}}}" if action.choices else ""
+    value = (action.metavar or choices or action.dest.upper()) if action.nargs != 0 else ""
+    return " ".join(filter(None, ["|".join(action.option_strings), str(value)]))
 
 
 def _arguments(parser: argparse.ArgumentParser) -> Iterator[str]:
-    for action in parser._actions:
-        if isinstance(action, (argparse._HelpAction, argparse._SubParsersAction)):
-            continue
-        choices = f"{{{','.join(map(str, action.choices))}}}" if action.choices else ""
-        value = (action.metavar or choices or action.dest.upper()) if action.nargs != 0 else ""
-        text = " ".join(filter(None, ["|".join(action.option_strings), str(value)]))
+    for action in _listed(parser):
+        text = _label(action)
         yield text if action.required and action.nargs != "*" else f"[{text}]"
+
+
+def commands_table() -> str:
+    """Every command with its help text."""
+    rows = (
+        (f"[`{name}`](#{name})", found.description or "")
+        for name, found in _parsers(cli.parser()).items()
+    )
+    return markdown(("command", "purpose"), rows)
+
+
+def options_table() -> str:
+    """Every argument and option with its commands; those that all commands have come last."""
+    parsers = _parsers(cli.parser())
+    rows: dict[tuple[str, str], list[str]] = {}
+    for name, found in parsers.items():
+        for action in _listed(found):
+            meaning = found._get_formatter()._expand_help(action)
+            rows.setdefault((_label(action), meaning), []).append(name)
+    names = {key: "all" if len(of) == len(parsers) else ", ".join(of) for key, of in rows.items()}
+    ordered = sorted(names, key=lambda key: names[key] == "all")
+    cells = (["`" + key[0].replace("|", ", ") + "`", names[key], key[1]] for key in ordered)
+    return markdown(["argument or option", "of", "meaning"], cells)
 
 
 # ---------------------------------------------------------------- columns

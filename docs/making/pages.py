@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import csv
 import os
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from multiprocessing import get_context
 from pathlib import Path
@@ -37,6 +37,13 @@ def markdown(head: Iterable[str], rows: Iterable[Sequence[str]]) -> str:
     first = lines([list(head)])
     found = lines(rows)
     return "\n".join([first, "|" + " --- |" * (first.count("|") - 1), *([found] if found else [])])
+
+
+def shown(rows: Iterable[Sequence[str]]) -> Iterator[Sequence[str]]:
+    """Print each row of a table as it comes."""
+    for row in rows:
+        print(" | ".join(row), flush=True)
+        yield row
 
 
 def between_marks(text: str, name: str, made: str) -> str:

@@ -225,7 +225,7 @@ def columns_on_request(means: Mapping[str, tuple[str, AngleOf]]) -> Columns:
 FACES = ("inner", "outer")
 FITTED_TO_FACE = (
     "mean over the face: fitted through two layers of elements "
-    "(docs/what_may_go_wrong.md, Stress at faces)"
+    "(docs/reliability.md, Stress at faces)"
 )
 ON_THE_FACE = 1e-6  # normalised depth within the rounding of coordinates
 SECOND_LAYER = 1.5  # depth over layer thickness, between the start of the second and third layer

@@ -246,13 +246,13 @@ class _SplitFormulation(DiscreteFormulation):
 
 NOT_LOCKING = "selective-integration"
 STIFF_BULK = {"hexahedron": 10.0, "tetrahedron": 300.0}
-"""Largest lambda/mu for which "auto" takes J at all points (docs/what_may_go_wrong.md, Spurious
+"""Largest lambda/mu for which "auto" takes J at all points (docs/reliability.md, Spurious
 reorientation by pressure noise). In remodeling tubes linear hexahedra had errors of 0.1 degrees at
 8.8, 2 degrees at 20, and 21 degrees and 8 % of the radii at 100. Quadratic tetrahedra had 0.6
 degrees at 300; with U at one point their own error is 0.3 %."""
 
 FORMULATIONS: dict[str, Formulation] = {
-    # The measurements behind these numbers are in docs/what_may_go_wrong.md, Elements that lock.
+    # The measurements behind these numbers are in docs/reliability.md, Elements that lock.
     "displacement": AtAllPoints("at all quadrature points; a run whose elements lock warns"),
     NOT_LOCKING: Selective(
         "the volumetric part of the matrix at fewer points; not for tetrahedra of degree 1",

@@ -63,7 +63,7 @@ class Profile:
         return (
             f"profile {name!r}: {self.settings_in_words()}. Measured on the artery of {self.cells} "
             f"cells: error of the fibre angle {self.degrees:g} degrees, of the radii "
-            f"{self.percent:g} %, CPU time {self.seconds:g} s (docs/speed_and_accuracy.md)"
+            f"{self.percent:g} %, CPU time {self.seconds:g} s (docs/reliability.md)"
         )
 
     def settings_in_words(self) -> str:

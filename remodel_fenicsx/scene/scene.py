@@ -290,7 +290,7 @@ class Scene(Table):
     preset: Annotated[str | None, OneOf(presets.PRESETS)] = None
     """Published model with the values of all keys that the scene does not set (presets below)."""
     profile: Annotated[str | None, OneOf(presets.PROFILES)] = None
-    """Settings of mesh, kinematics and steps for speed or accuracy (docs/speed_and_accuracy.md)."""
+    """Settings of mesh, kinematics and steps for speed or accuracy (docs/reliability.md)."""
     geometry: Annotated[SerializeAsAny[Shape], VariantOf(SHAPES, "shape")]
     mesh: Mesh = Mesh()
     model: Model = Model()

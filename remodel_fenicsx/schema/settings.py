@@ -119,7 +119,7 @@ class Mesh(Table):
         description=f"Treatment of the volume change in an element. 'auto' takes {NOT_LOCKING!r} "
         f"if lambda/mu exceeds {STIFF_BULK['hexahedron']:g} (tetrahedra of degree 2: "
         f"{STIFF_BULK['tetrahedron']:g}), unless something else needs 'displacement'. "
-        f"{meanings(FORMULATIONS)} (docs/what_may_go_wrong.md).",
+        f"{meanings(FORMULATIONS)} (docs/reliability.md).",
     )
 
     def _faults(self) -> Faults:
@@ -1196,7 +1196,7 @@ class Solver(Table):
         description=f"Solver of each step's equations. 'auto' takes 'direct' up to {MAX_DIRECT_3D} "
         f"unknowns ({MAX_DIRECT_REDUCED} of a reduction), then 'lagged', and above "
         f"{MIN_MULTIGRID} 'iterative' where a factorisation costs more. {meanings(SOLVER_METHODS)} "
-        "(docs/speed_and_accuracy.md).",
+        "(docs/reliability.md).",
     )
     predictor: Literal["none", "autoregressive", "with-tolerance"] = "autoregressive"
     """Start of Newton's method in a step. 'none': the displacement of the previous step.

@@ -350,7 +350,7 @@ def last_line(said: str) -> str:
 # ---------------------------------------------------------------- readers of untrusted files
 # Each reader runs with limits, checks the format first, and opens no other file. All rules that
 # hold for every format are here, so that a new reader cannot bypass them
-# (docs/what_may_go_wrong.md).
+# (docs/reliability.md).
 
 LARGEST_FILE = 2 * 10**9  # bytes; ten million hexahedra take 1.1 GB
 SECONDS, SECONDS_PER_MB = 20.0, 1.0  # CPU time

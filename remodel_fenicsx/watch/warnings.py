@@ -25,7 +25,7 @@ Array = NDArray[np.float64]
 # Elements are too stiff if nearly incompressible tissue makes them lock, or if the strain varies
 # too much inside them.
 
-# Missing fraction of the displacement above which a run warns. docs/what_may_go_wrong.md has the
+# Missing fraction of the displacement above which a run warns. docs/reliability.md has the
 # estimate and its error. The paper's bodies have at most 3.6 % (artery with random cells, t = 5).
 MAX_MISSING_FRACTION = 0.05
 # Work / energy of the matrix. With less work the cells deform the body, not the loads.
@@ -247,7 +247,7 @@ class PressureNoise(ElementWarning):
             f"pressure oscillations change the principal tensions by {turned:.2g} degrees on "
             "average; fibre angles and radii are inaccurate "
             f"(lambda/mu up to {self.ratio:.4g}); {self.remedy} "
-            "(docs/what_may_go_wrong.md, Spurious reorientation by pressure noise)"
+            "(docs/reliability.md, Spurious reorientation by pressure noise)"
         )
 
 

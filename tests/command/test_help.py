@@ -52,22 +52,10 @@ def test_the_help_names_what_there_is_without_loading_it() -> None:
 
 
 @pytest.mark.parametrize("name", COMMANDS)
-def test_the_page_of_commands_has_an_example_and_every_option(name: str) -> None:
-    """In the section of the command, or in the table of options of most commands."""
+def test_the_page_of_commands_has_an_example(name: str) -> None:
+    """In the section of the command; `docs/make options` lists its options."""
     page = (Path(__file__).parents[2] / "docs" / "commands.md").read_text(encoding="utf-8")
-    common = page.split("\n## Run and look\n")[0].split("Most commands")[1]
-    (section,) = re.findall(
-        rf"^### (?:\w+ and )?{name}(?: and \w+)?\n(.*?)(?=^##)", page, re.MULTILINE | re.DOTALL
-    )
+    (section,) = re.findall(rf"^### {name}\n(.*?)(?=^##)", page, re.MULTILINE | re.DOTALL)
     for line in re.findall(r"^\./with-fenicsx remodel-fenicsx (.*)$", section, re.MULTILINE):
-        assert cli.parser().parse_args(shlex.split(line.split(" > ")[0])).command in (
-            name,
-            "picture",
-            "animate",
-        )
+        assert cli.parser().parse_args(shlex.split(line.split(" > ")[0])).command == name
     assert f"remodel-fenicsx {name}" in section
-    for action in COMMANDS[name]._actions:
-        option = next((o for o in action.option_strings if o.startswith("--")), "")
-        short = next((o for o in action.option_strings if not o.startswith("--")), option)
-        if option != "--help":
-            assert option in section + common or short in section + common, option

@@ -64,7 +64,7 @@ def test_the_python_of_the_readme_runs_as_it_stands(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("name", ["README.md", "CONTRIBUTING.md", *(f"docs/{name}.md" for name in (
     "architecture", "commands", "start", "interface", "model", "solver", "time_integration", "verification",
-    "what_may_go_wrong"))])  # fmt: skip
+    "reliability"))])  # fmt: skip
 def test_files_and_modules_that_a_page_names_are_there(name: str) -> None:
     """Paths in backticks or links, and modules after the package's name."""
     text = re.sub(r"```.*?```", "", page(name), flags=re.DOTALL)

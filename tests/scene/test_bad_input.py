@@ -46,7 +46,7 @@ MADE: Counter[str] = Counter()  # kind: how many there have been
 def bad(
     kind: str, number: int, what: str, /, **strategies: Any
 ) -> Callable[[Callable[..., None]], Callable[..., None]]:
-    """A test with so many inputs, times BAD_INPUTS; docs/what_may_go_wrong.md says how many there are."""
+    """A test with so many inputs, times BAD_INPUTS; docs/reliability.md says how many there are."""
     INPUTS[kind] = number, what
     chosen = settings(
         max_examples=number * FACTOR, derandomize=FACTOR == 1, deadline=None, database=None,
@@ -446,5 +446,5 @@ def test_docs_say_how_many_there_are() -> None:
     assert sum(number for number, _ in INPUTS.values()) >= 1000
     for kind, made in MADE.items():
         assert made >= INPUTS[kind][0] * FACTOR, kind
-    text = (Path(__file__).parents[2] / "docs" / "what_may_go_wrong.md").read_text(encoding="utf-8")
+    text = (Path(__file__).parents[2] / "docs" / "reliability.md").read_text(encoding="utf-8")
     assert f"makes {sum(number for number, _ in INPUTS.values()):,} such inputs" in text
