@@ -101,8 +101,7 @@ def _groups(dimension: int) -> dict[str, int]:
     names = [gmsh.model.getPhysicalName(dimension, tag) or str(tag) for tag in tags]
     twice = next((name for name in names if names.count(name) > 1), None)
     if twice is not None:
-        kind = "faces" if dimension == 2 else "volumes"
-        raise GeometryError(f"two physical groups of {kind} have the name {twice!r}; rename one")
+        raise GeometryError(f"two physical groups have the name {twice!r}; rename one")
     return dict(zip(names, tags, strict=True))
 
 
