@@ -278,8 +278,8 @@ def reset_simulation(simulation: Simulation, start: Snapshot, scene: Scene) -> b
     stepper, kinematics = simulation.stepper, simulation.state.kinematics
     parameters = stepper.tissue.parameters
     varies = {name: isinstance(value, Function) for name, value in tissue.parameters.items()}
-    # Adaptive time stepping, growth and the stability check keep copies of scene values, which a
-    # reset would not update.
+    # Adaptive time stepping, growth and solver.unstable = 'stop' keep copies of scene values, which
+    # a reset would not update.
     has_variable_steps = not isinstance(simulation.time_stepping, FixedSteps)
     must_rebuild = has_variable_steps or kinematics.grows or scene.solver.unstable == "stop"
     if (

@@ -92,7 +92,7 @@ def named_groups() -> tuple[dict[str, int], dict[str, int]]:
                 " and ".join(repr(name) for name, tag in regions.items() if tag in groups)
                 or "no physical group"
             )
-            raise GeometryError(f"volume {volume} is in {names}; each must be in exactly one")
+            raise GeometryError(f"volume {volume} is in {names}; a volume must be in one group")
     return faces, regions
 
 

@@ -523,10 +523,10 @@ def _with_surface(file: MeshFile, path: Path) -> MeshFile:
         axis=1, keepdims=True
     )
     if far.any():
-        where = f"at {format_position(corners[far][0])}, the nearest is {away[far][0]:.3g} away"
-        rule = f"{where}: is it the surface of this mesh, in its unit?"
+        where = f"at {format_position(corners[far][0])}, {away[far][0]:.3g} from the nearest node"
+        rule = "The surface must belong to this mesh, in the same unit"
         raise UnreadableFile(
-            f"{path.name}: {far.sum()} triangle corners are not nodes of the mesh, the first {rule}"
+            f"{path.name}: {far.sum()} triangle corners are no nodes, the first {where}. {rule}"
         )
     number = 1 + max([*unique_in_order(file.facet_groups), *file.names[2].values()], default=0)
     return replace(

@@ -1,4 +1,4 @@
-"""Couplings of equilibrium and remodeling in one step: strategies on the same state."""
+"""Couplings of equilibrium and remodeling in one step, of which a simulation uses one."""
 
 from __future__ import annotations
 
@@ -36,8 +36,8 @@ NO_TIME = -1.0  # time of a record without a target
 # A point gains a target when the target's switch (1 under tension, 0 without; `tensor_law`)
 # reaches this. Below it the target changes the cells by less than the time error of a step.
 MIN_TARGET_WEIGHT = 0.01
-# The next rate is predicted as a weighted sum of the last SUMMED rates, whose weights are fitted to
-# the last FITTED rates.
+# The next rate of the unknowns is predicted as a weighted sum of their last SUMMED rates, with
+# weights that are fitted to the last FITTED rates.
 SUMMED, FITTED = 3, 2
 SAME_RATE = 1e-9  # relative tolerance of equal load rates
 DEPENDENT = 1e-12  # relative singular value; rates below it count as linearly dependent
@@ -136,7 +136,8 @@ class Traits(NamedTuple):
         True if the errors of all steps add up; False if the only error is a delay of the cells and
         of other remodeling processes by one step.
     max_scaled_step
-        Largest adaptive step times kappa; an explicit rule oscillates with larger steps.
+        Largest adaptive step times the largest rate of all processes; an explicit rule oscillates
+        with larger steps.
 
     Examples
     --------
@@ -326,7 +327,7 @@ class Staggered:
 
     @property
     def higher_order_cells(self) -> UnitCell | None:
-        """Cells after an unrelaxed pass with the solved stress; the row has those before it."""
+        """Cells after an unrelaxed pass with the solved stress; output has the cells before it."""
         return self.remodeling.full_pass_cells
 
     def close(self) -> None:
@@ -481,9 +482,9 @@ def between(old: LoadValues, new: LoadValues, fraction: float) -> LoadValues:
 class Extrapolated(Staggered):
     """Second-order coupling: remodel with an extrapolated target, then solve."""
 
-    # A `Target` is the tensor T that A/r0^2 approaches and the switch s of its rate. Their product
-    # is extrapolated from the last two steps to the middle of this step of size h: s T + h/2
-    # d(s T)/dt. See docs/time_integration.md, Extrapolated coupling.
+    # A `Target` holds the tensor E that A/r0^2 approaches, and the switch s, the active fraction of
+    # kappa. Their product is extrapolated from the last two steps to the middle of this step of
+    # size h: s E + h/2 d(s E)/dt. See docs/time_integration.md, Extrapolated coupling.
 
     traits = Traits(order=2, accumulates=True, max_scaled_step=0.5)
 

@@ -159,7 +159,7 @@ class RemodelingPass(Remodels):
         F, tensor = self.driving_tensor()
         noise, rounding = self.noise(F, tensor, residual)
         cells = self.state.cells
-        # If the driver has these principal axes, the cells do not rotate.
+        # Principal axes of a driver for which the cells do not rotate.
         steady = cells.point_cells.axes
         if not self.driver.material and self.frame.carries_axes:
             steady = convected_axes(F, steady)
@@ -233,7 +233,7 @@ class RemodelingPass(Remodels):
     def updated_cells(
         self, time_old: float, time_new: float, residual: float = 0.0, cells: UnitCell | None = None
     ) -> tuple[UnitCell, Array]:
-        """Compute the cells after a pass from `cells` or the present ones, and F (n, 3, 3)."""
+        """Compute the cells after a pass from `cells` or the present ones, and F_e (n, 3, 3)."""
         # Cells are flattened over the quadrature points. The state does not change.
         cells = self.state.cells.point_cells if cells is None else cells
         if self._averages_targets:
@@ -272,7 +272,7 @@ class RemodelingPass(Remodels):
     def cells_towards(
         self, target: Target, duration: float, cells: UnitCell | None = None
     ) -> UnitCell:
-        """Compute the cells after a time of a constant target, from `cells` or the present ones."""
+        """Compute the cells after a constant target; default start: the present cells."""
         assert self.law.follow is not None
         r0 = self.parameters.at_points().end_to_end_length
         return self.law.follow(
@@ -293,7 +293,7 @@ class RemodelingPass(Remodels):
         return self.replace(full_pass, F, time_new - time_old, self.relaxation)
 
     def replace(self, full_pass: UnitCell, F: Array, duration: float, factor: float = 1.0) -> float:
-        """Replace the cells by those of a relaxed pass; return the power at frozen F."""
+        """Replace the cells by those of a relaxed pass; return the power at frozen F_e."""
         cells = self.state.cells
         self._last_pass = cells.point_cells.copy(), full_pass
         updated = self.law.relax(self._last_pass[0], full_pass, factor)
@@ -314,8 +314,9 @@ class RemodelingPass(Remodels):
 
     def distance(self) -> float:
         """Return max |A_pass - A| of the last pass, in squared link lengths."""
-        # A belongs to the solved state. The distance is zero if a pass reproduces the cells, that
-        # is, if they are in equilibrium with their own stress. NaN before the first pass.
+        # A is that of the cells before the pass, for 'extrapolated' at the start of the step. The
+        # distance is zero if a pass reproduces the cells, that is, if they are in equilibrium with
+        # their own stress. NaN before the first pass.
         if not self.law.remodels or self._last_pass is None:
             return float("nan")
         before, after = (structure_tensor(*cells[:2]) for cells in self._last_pass)
@@ -371,7 +372,7 @@ class RemodelingPass(Remodels):
         return self.quadrature.maximum(np.linalg.norm(change, axis=(-1, -2)) / r0**2)
 
     def apply_change(self, change: Array, factor: float, time: float, residual: float) -> None:
-        """Apply a multiple of a new pass, because `change` lacks points without tension."""
+        """Apply a multiple of a new pass; `change` is not used: 0 at points without tension."""
         remodeled, _ = self.updated_cells(self.state.time, time, residual)
         cells = self.state.cells
         self.set(relaxed(cells.point_cells.copy(), remodeled, factor))

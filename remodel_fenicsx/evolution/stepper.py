@@ -172,7 +172,7 @@ class WarnsOnce(Watcher):
     Attributes
     ----------
     name
-        Prefix of names in the state.
+        Prefix of the names of its numbers in the state.
     initial
         Initial values of numbers that carry over from step to step, by name.
     level
@@ -648,7 +648,7 @@ def notify_undone(watchers: Sequence[Watcher], step: Step) -> Iterator[None]:
 def times(end: float, step: float) -> Iterator[float]:
     """Yield times of steps: decimal multiples of the step (3 * 0.1 is 0.3), and the end.
 
-    The last step takes the remainder: 0.5 to 1.5 of a step.
+    The last step takes the remainder: 0.5 to 1.5 of a step, or less if it is the only one.
 
     Parameters
     ----------
@@ -696,7 +696,8 @@ class Pause(Watcher):
         self.comm, self.folder = comm, folder
         self.is_requested, self.deadline = is_requested, deadline
         self._last = clock.monotonic()
-        self._seconds = 0.0  # longest wall time of a step with its output; halved with each step
+        # Longest wall time of recent steps with their output; that of older steps halves per step.
+        self._seconds = 0.0
 
     def started(self, step: Step) -> None:
         """Check for a stop before the first step."""

@@ -116,7 +116,7 @@ class Growth:
 class DecayMonitor:
     """Monitor of a rate: does it decay faster than 1/t, t being the time under constant loads?"""
 
-    # It compares the rate at t with an earlier rate, taken between t/4 and t/2.
+    # It compares the rate at t with one at t/2 or before; with short steps, between t/4 and t/2.
 
     INITIAL = dict.fromkeys(("early_time", "early_rate", "late_time", "late_rate"), 0.0)
 
@@ -270,7 +270,8 @@ class TurnoverPass(Remodels):
 
     def apply_change(self, change: Array, factor: float, time: float, residual: float) -> None:
         """Apply a multiple of the change of `change_to_limit`."""
-        self.change(change.reshape(-1, 2).T, factor)  # as rates over the duration `factor`
+        # `change` as rates, for a duration of `factor`, gives factor * change.
+        self.change(change.reshape(-1, 2).T, factor)
 
     def begin_path(self) -> None:
         """Reset the monitor of the rates."""

@@ -640,7 +640,7 @@ IN_ITS_PLACE = (
 
 
 def _refuse_implicit(*parts: object) -> NoReturn:
-    text = f"this run can only be continued by version 0.4.0; {IN_ITS_PLACE}"
+    text = f"only version 0.4.0 can continue this run; for a new run {IN_ITS_PLACE}"
     raise SceneError(f"remodeling.coupling = {IMPLICIT!r}: {text}")
 
 

@@ -45,18 +45,17 @@ FORCE_ROUNDINGS = 8.0  # accepted residual as a multiple of the rounding error o
 # eps |u|/h. On thin and on stiff walls 0.07 to 4 was measured.
 ROUNDED_STRAINS = 8.0
 # Largest error of a prescribed displacement, relative to the body's size. It needs a tolerance of
-# its own, because the residual is zero at constrained dofs.
+# its own, because at constrained dofs the residual is this error, not a force.
 PRESCRIBED_TOLERANCE = 1e-10
-# Gap below which prescribed values count as met, relative to the body's size.
+# Gap, relative to the body's size, below which a Newton step need not correct prescribed values.
 PRESCRIBED_ROUNDING = 1e-13
 # Residual at which a substep of a change of the cells ends, relative to the nodal forces; the last
 # substep has the full tolerance. Jump detection compares the displacements of successive substeps.
 # With 1e-3 the quasi-Newton solver stopped too early, and some substeps were mistaken for jumps.
 INTERMEDIATE_TOLERANCE = 1e-5
-NEARLY_STRAIGHT = 0.99  # r/L above which the rounding error of one point may dominate
-# Ratio of tolerance and nodal forces above which, if also r/L > NEARLY_STRAIGHT, the rounding error
-# of one point may dominate the tolerance.
-COARSE = 1e-8
+# With r/L above NEARLY_STRAIGHT and a tolerance above COARSE times the nodal forces, the rounding
+# error of one point may dominate the tolerance.
+NEARLY_STRAIGHT, COARSE = 0.99, 1e-8
 # Newton's method stagnates if a residual exceeds this fraction of the residual before it.
 STAGNATION = 0.25
 
@@ -90,7 +89,7 @@ class Convergence:
         # The rounding error is computed for the largest r/L and the largest displacement of the
         # body. Near L it may be far above the rounding error of most points. If so (`coarse`), a
         # residual above the requested tolerance is accepted only if Newton's method stagnates.
-        # Otherwise this condition applies only to the error of rounded displacements.
+        # Otherwise only a residual that rounded displacements explain requires this.
         if self.prescribed_gap > PRESCRIBED_TOLERANCE:
             return False
         if self.intermediate and norm <= INTERMEDIATE_TOLERANCE * self.force_scale:
@@ -225,7 +224,7 @@ LARGE = 50_000  # number of unknowns above which an iteration takes seconds
 
 
 def failure_text(reason: int, iterations: int, limits: StateLimits) -> str:
-    """Return why a solve has failed: SNES's reason, or a converged but inadmissible state."""
+    """Return why a solve has failed: SNES's reason, or an inadmissible last state."""
     if reason >= 0:
         return (
             f"the state is not admissible: r/L = {limits.max_chain_extension:.4f}, "
@@ -387,8 +386,8 @@ class GuardedNewton:
     def newton_correction(self, equilibrium: Equilibrium, tangents: int) -> Array:
         """Return the Newton step for the residual of `equilibrium`. Collective.
 
-        The tangent is the last one. If `tangents`, the number that was assembled for this state, is
-        0, it is assembled here, unless the method reuses a factorisation.
+        The last tangent is used. If none was assembled for this state (`tangents` is 0), it is
+        assembled here; a method that reuses factorisations does so only if it has none.
         """
         self._to_petsc(self._x)
         equilibrium.assemble_internal(self._residual)
@@ -494,6 +493,8 @@ class GuardedNewton:
             self._from_petsc(trial)
             after = self.equilibrium.evaluate()
             if after.limits.stop_signal or self._allows(before, after):
+                if halving:
+                    log.debug("Newton step shortened to 1/%d: r < L and J > 0", 2**halving)
                 break
             step.scale(0.5)
         else:
@@ -502,8 +503,6 @@ class GuardedNewton:
                 LINE_SEARCH_HALVINGS,
             )
         present.short_steps = present.short_steps + 1 if halving >= SHORT_STEP_HALVINGS else 0
-        if halving:
-            log.debug("Newton step shortened to 1/%d to keep r < L and J > 0", 2**halving)
         return improved or halving > 0
 
     def _allows(self, before: PointState, after: PointState) -> bool:

@@ -409,7 +409,7 @@ def _factor(
             problems.append(str(error))
             continue
         if (by := getattr(table, key) if key else 1.0) is None:
-            raise SceneError(f"{place}: needs {key}, by which it is divided")
+            raise SceneError(f"{place}: needs the key {key!r}, by which the column is divided")
         return factor / by, key
     raise SceneError(f"{place}: {'; '.join(problems)}")
 
@@ -477,7 +477,7 @@ def _check_columns(
             raise SceneError(f"{place}: needs a column 'time', because state = 'history'")
         if loads:
             raise SceneError(
-                f"{place}: {loads[0]}: with state = 'history' the scene's own ramps hold"
+                f"{place}: {loads[0]}: state = 'history' takes the scene's loads; remove it"
             )
         if scene.time.is_equilibrium or not (
             0 <= columns["time"].min() <= columns["time"].max() <= scene.last_time

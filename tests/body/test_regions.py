@@ -167,8 +167,8 @@ def test_named_volumes_become_regions(numbers: bool) -> None:
 
 
 @pytest.mark.parametrize("groups, line", [
-    ({"lower": [1]}, "volume 2 is in no physical group; each must be in exactly one"),
-    ({"lower": [1, 2], "upper": [2]}, "volume 2 is in 'lower' and 'upper'; each must be in exactly one"),
+    ({"lower": [1]}, "volume 2 is in no physical group; a volume must be in one group"),
+    ({"lower": [1, 2], "upper": [2]}, "volume 2 is in 'lower' and 'upper'; a volume must be in one group"),
     ({}, "0 named volumes, 1 types of elements, 1 named faces; must be at least 1, exactly 1 and at least 1"),
 ])  # fmt: skip
 def test_volumes_that_are_not_shared_out_are_refused(

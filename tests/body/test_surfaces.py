@@ -129,8 +129,8 @@ def inside(files: dict[str, Path]) -> None:
 
 
 @pytest.mark.parametrize(("change", "line"), [
-    (shifted, "lumen.vtp: [0-9]+ triangle corners are not nodes of the mesh, the first at .*is it the surface of"),
-    (in_metres, "lumen.vtp: [0-9]+ triangle corners are not nodes of the mesh, the first at .* away: is it the"),
+    (shifted, "lumen.vtp: [0-9]+ triangle corners are no nodes, the first at .* node. The surface must belong"),
+    (in_metres, "lumen.vtp: [0-9]+ triangle corners are no nodes, the first at .* from the nearest node. The"),
     (lambda files: files["inner"].write_bytes(b"<VTKFile>"), "lumen.vtp: cannot be read: "),
     (lambda files: files["inner"].write_bytes(files["inner"].read_bytes()[:900]), "lumen.vtp: "),
     (lambda files: files["inner"].unlink(), "no such file: .*lumen.vtp"),

@@ -57,7 +57,7 @@ def test_a_run_with_the_coupling_that_went_is_read_alone(
     assert Recording(folder).scene.remodeling.coupling == "implicit"
     assert cli.main(["run", "--resume", str(folder), "--set", "time.end=3"]) == 2
     assert (
-        "remodeling.coupling = 'implicit': this run can only be continued by version"
+        "remodeling.coupling = 'implicit': only version 0.4.0 can continue this run"
         in capsys.readouterr().err
     )
 
