@@ -4,7 +4,7 @@ In the homeostatic state of a law with a limit the cells belong to their own str
 the principal axes, or A = r0^2 E. A body may have several such states, and a point without tension
 keeps its cells, so that the state depends on the load path. Therefore the path is integrated in
 adaptive steps, which grow under constant loads, until the cells hardly change. The tail of their
-exponential decay is extrapolated (docs/time_integration.md, "Homeostatic state").
+exponential decay is extrapolated (docs/solver.md, "Homeostatic state").
 """
 
 from __future__ import annotations
@@ -305,7 +305,7 @@ class Homeostasis:
             self._log(
                 NOTICE,
                 "the cells have a front near %.4g, %.4g, %.4g: A jumps by %.2g r0^2. Its position "
-                "depends on the load path, time.tolerance and the mesh (docs/time_integration.md)",
+                "depends on the load path, time.tolerance and the mesh (docs/solver.md)",
                 *position,
                 jump,
             )
@@ -314,7 +314,7 @@ class Homeostasis:
             self._log(
                 NOTICE,
                 "%.3g %% of the body carries no tension in equilibrium; the cells there depend on "
-                "the load path (docs/time_integration.md)",
+                "the load path (docs/solver.md)",
                 100 * fraction,
             )
         return 0.0

@@ -1102,8 +1102,7 @@ class Time(Table):
         json_schema_extra={"allowed": "a finite number greater than 0, or 'equilibrium'"}
     )
     """End time, a multiple of time.step; with a tolerance any time. 'equilibrium': the homeostatic
-    state under the loads at the end of their ramps (docs/time_integration.md, Homeostatic
-    state)."""
+    state under the loads at the end of their ramps (docs/solver.md, Homeostatic state)."""
     step: float = Field(default=1.0, gt=0)
     """Time between two remodeling passes. With a tolerance it is the first step size."""
     tolerance: float | None = Field(

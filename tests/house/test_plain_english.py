@@ -15,7 +15,6 @@ PAGES = {
     str(page.relative_to(ROOT)): page
     for folder in (ROOT, ROOT / "docs")
     for page in sorted(folder.glob("*.md"))
-    if ".template" not in page.name
 }
 LINE, PARAGRAPH = 100, 80  # characters, words
 
