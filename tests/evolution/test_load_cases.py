@@ -167,6 +167,13 @@ def test_which_case_is_first_changes_no_cell() -> None:
     ] == pytest.approx(0.6 * 4.8)
 
 
+def test_a_step_has_the_loads_of_the_case_that_a_watcher_sees() -> None:
+    with made(artery(pulse(0.4))) as simulation:
+        step = next(simulation.steps())
+        further = simulation.stepper.load_cases[1].seen(step)
+    assert further.loads["pressure"] == pytest.approx(3 * step.loads["pressure"]) != 0.0
+
+
 def test_a_pulse_is_seen_as_its_mean() -> None:
     """The figures of docs/load_cases.md: a normal pulse does not count, axial excursions and the largest tension do."""
     mean = rest_of_the_mean()
