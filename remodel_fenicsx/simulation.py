@@ -205,7 +205,7 @@ def _solver(scene: Scene) -> Solver:
 
 
 def _remodeling(scene: Scene, comm: MPI.Intracomm) -> Remodeling:
-    """Return the remodeling settings, with the coupling 'relaxed' if passes would oscillate."""
+    """Return the remodeling settings, with 'relaxed' if the path to a steady state oscillates."""
     # When the driver's principal values change their order, random cells jump, however small the
     # step, and the passes oscillate.
     if not (scene.time.is_equilibrium and scene.has_random_cells and scene.cell_order_can_change):

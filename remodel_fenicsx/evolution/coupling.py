@@ -40,7 +40,7 @@ MIN_TARGET_WEIGHT = 0.01
 # weights that are fitted to the last FITTED rates.
 SUMMED, FITTED = 3, 2
 SAME_RATE = 1e-9  # relative tolerance of equal load rates
-DEPENDENT = 1e-12  # relative singular value; rates below it count as linearly dependent
+DEPENDENT = 1e-12  # relative size of singular values that the fit of the weights omits
 
 
 # ---------------------------------------------------------------- starting values of Newton

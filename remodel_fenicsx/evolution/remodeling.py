@@ -41,18 +41,19 @@ Array = NDArray[np.float64]
 # times the force over the face area. A stress that is pulled back to the reference configuration is
 # larger still.
 RESIDUAL_STRESS_FACTOR = 20.0
-# The bound that the residual gives is limited to this fraction of the body's stress. A tension
-# below the fraction carries hardly any load, and may be treated as zero.
+# The bound that the residual gives is limited to this fraction of the body's stress, or to the
+# error by rounding if that is larger. A tension below the fraction carries hardly any load, and may
+# be treated as zero.
 MAX_RESIDUAL_STRESS_FRACTION = 1e-2
-# A warning is logged if (stress of the residual) / (body's stress) exceeds this. Measured for the
-# artery in one dimension with the law "tensor": ratio 0.02 to 0.05, error of radii below 0.1 %;
-# ratio 0.4, error 2 %.
+# A run warns once if (stress of the residual) / (body's stress) exceeds this and the limit above.
+# Measured for the artery in one dimension with the law "tensor": ratio 0.02 to 0.05, error of radii
+# below 0.1 %; ratio 0.4, error 2 %.
 WARNED_RESIDUAL_FRACTION = 0.1
 STRESS_ROUNDINGS = 64.0  # error of a principal value as a multiple of a stress's rounding error
 MIN_ACTIVATION = 0.5  # switch below which a point counts as a point without tension
 LOOSE_SOLVER = (
     "the residual may correspond to stresses of up to %.2g (RMS stress of the body: %.2g); "
-    "stresses below %.2g are treated as zero. Lower solver.relative_tolerance or "
+    "stresses below %.2g remodel slowly or not at all. Lower solver.relative_tolerance or "
     "solver.absolute_tolerance"
 )
 
@@ -159,7 +160,7 @@ class RemodelingPass(Remodels):
         F, tensor = self.driving_tensor()
         noise, rounding = self.noise(F, tensor, residual)
         cells = self.state.cells
-        # Principal axes of a driver for which the cells do not rotate.
+        # Axes that the driver would have if the cells did not rotate.
         steady = cells.point_cells.axes
         if not self.driver.material and self.frame.carries_axes:
             steady = convected_axes(F, steady)
@@ -272,7 +273,7 @@ class RemodelingPass(Remodels):
     def cells_towards(
         self, target: Target, duration: float, cells: UnitCell | None = None
     ) -> UnitCell:
-        """Compute the cells after a constant target; default start: the present cells."""
+        """Compute the cells after a time with a constant target; default: the present cells."""
         assert self.law.follow is not None
         r0 = self.parameters.at_points().end_to_end_length
         return self.law.follow(
@@ -314,9 +315,9 @@ class RemodelingPass(Remodels):
 
     def distance(self) -> float:
         """Return max |A_pass - A| of the last pass, in squared link lengths."""
-        # A is that of the cells before the pass, for 'extrapolated' at the start of the step. The
-        # distance is zero if a pass reproduces the cells, that is, if they are in equilibrium with
-        # their own stress. NaN before the first pass.
+        # A belongs to the cells before the pass, with 'extrapolated' to the cells at the start of the
+        # step. The distance is zero if a pass reproduces the cells, that is, if they are in
+        # equilibrium with their own stress. NaN before the first pass.
         if not self.law.remodels or self._last_pass is None:
             return float("nan")
         before, after = (structure_tensor(*cells[:2]) for cells in self._last_pass)
@@ -372,7 +373,7 @@ class RemodelingPass(Remodels):
         return self.quadrature.maximum(np.linalg.norm(change, axis=(-1, -2)) / r0**2)
 
     def apply_change(self, change: Array, factor: float, time: float, residual: float) -> None:
-        """Apply a multiple of a new pass; `change` is not used: 0 at points without tension."""
+        """Apply a multiple of a new pass, not `change`, which is zero at points without tension."""
         remodeled, _ = self.updated_cells(self.state.time, time, residual)
         cells = self.state.cells
         self.set(relaxed(cells.point_cells.copy(), remodeled, factor))

@@ -41,7 +41,7 @@ log = logging.getLogger(__name__)
 CHECK_INTERVAL = 5
 
 
-# Users do not create steps, so that the arguments need no deprecated names.
+# Only this module creates steps. Therefore the arguments have no deprecated names.
 @partial(with_old_names, arguments=False)
 @dataclass
 class Step:
@@ -648,7 +648,7 @@ def notify_undone(watchers: Sequence[Watcher], step: Step) -> Iterator[None]:
 def times(end: float, step: float) -> Iterator[float]:
     """Yield times of steps: decimal multiples of the step (3 * 0.1 is 0.3), and the end.
 
-    The last step takes the remainder: 0.5 to 1.5 of a step, or less if it is the only one.
+    The last step ends at `end`: it has 0.5 to 1.5 of `step`, or less if it is the only one.
 
     Parameters
     ----------
@@ -696,7 +696,7 @@ class Pause(Watcher):
         self.comm, self.folder = comm, folder
         self.is_requested, self.deadline = is_requested, deadline
         self._last = clock.monotonic()
-        # Longest wall time of recent steps with their output; that of older steps halves per step.
+        # Wall time of the last step with its output, or half of the former value if that is larger.
         self._seconds = 0.0
 
     def started(self, step: Step) -> None:

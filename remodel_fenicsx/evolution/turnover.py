@@ -270,7 +270,7 @@ class TurnoverPass(Remodels):
 
     def apply_change(self, change: Array, factor: float, time: float, residual: float) -> None:
         """Apply a multiple of the change of `change_to_limit`."""
-        # `change` as rates, for a duration of `factor`, gives factor * change.
+        # The method multiplies rates by a duration: here `change` by `factor`.
         self.change(change.reshape(-1, 2).T, factor)
 
     def begin_path(self) -> None:

@@ -315,7 +315,7 @@ class Continuation:
             )
             log.warning(
                 "time %g: jump to another solution branch (largest displacement change %.3g). "
-                "The previous branch ends at %s (%s). Set a smaller time.step to resolve it",
+                "The previous branch ends at %s (%s)",
                 self.time, far, loads or "the start", refusal,
             )  # fmt: skip
 

@@ -89,7 +89,7 @@ class Convergence:
         # The rounding error is computed for the largest r/L and the largest displacement of the
         # body. Near L it may be far above the rounding error of most points. If so (`coarse`), a
         # residual above the requested tolerance is accepted only if Newton's method stagnates.
-        # Otherwise only a residual that rounded displacements explain requires this.
+        # Otherwise this holds only for a residual that rounded displacements alone explain.
         if self.prescribed_gap > PRESCRIBED_TOLERANCE:
             return False
         if self.intermediate and norm <= INTERMEDIATE_TOLERANCE * self.force_scale:
@@ -130,13 +130,13 @@ class Convergence:
 # RESERVE of the 1 - r/L that it had before the step.
 NEAR_LIMIT, RESERVE = 0.95, 0.3
 NOT_EVALUATED = StateLimits(0.0, 1.0, (np.nan,) * 3)
-LINE_SEARCH_HALVINGS = 20  # number of halvings of a Newton step before the line search fails
+LINE_SEARCH_HALVINGS = 20  # largest number of halvings of a Newton step to keep r < L and J > 0
 # Number of Newton steps in a row, and of halvings of each, after which a solve fails. Solves that
 # succeed have at most two such steps; on a thin wall under too much load all steps are that short.
 SHORT_STEPS, SHORT_STEP_HALVINGS = 4, 6
-# A solve of a large body diverges if its residual exceeds DIVERGED times the first one, and half of
-# the residual DIVERGENCE_WINDOW iterations before. Without this limit, the first load step of an
-# aorta fails after 13 iterations with a residual 13 times the first one; each iteration has a
+# A solve of a large body diverges if its residual exceeds both DIVERGED times the first one and
+# half of the residual DIVERGENCE_WINDOW iterations before. Without this limit, the first load step
+# of an aorta fails after 13 iterations with a residual 13 times the first one; each iteration has a
 # factorisation. Small bodies may take all iterations, because some succeed after such a residual.
 DIVERGED, DIVERGENCE_WINDOW = 3.0, 4
 # Smallest displacement of a jump, relative to the body's size; for a tube ten radii long this is
@@ -216,7 +216,7 @@ SNES_REASONS = {
     -3: "the linear solver failed",
     -4: "overflow or NaN in the residual; check units and magnitudes of loads and parameters",
     -6: "the line search did not reduce the residual",
-    -8: "the guards r < L and J > 0 make all Newton steps too short",
+    -8: "the guards r < L and J > 0 made the last Newton steps too short",
     -9: "the residual diverges",
 }
 DIVERGED_MAX_IT = -5
@@ -386,8 +386,8 @@ class GuardedNewton:
     def newton_correction(self, equilibrium: Equilibrium, tangents: int) -> Array:
         """Return the Newton step for the residual of `equilibrium`. Collective.
 
-        The last tangent is used. If none was assembled for this state (`tangents` is 0), it is
-        assembled here; a method that reuses factorisations does so only if it has none.
+        If no tangent was assembled for this state (`tangents` is 0), it is assembled here. A method
+        that reuses factorisations uses its last one instead, if there is one.
         """
         self._to_petsc(self._x)
         equilibrium.assemble_internal(self._residual)

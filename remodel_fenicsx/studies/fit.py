@@ -167,7 +167,7 @@ class MeasuredTable(Table):
     def _go_together(self) -> MeasuredTable:
         if (self.time is not None) != (self.state == "after"):
             raise validation_error(
-                "goes with state = 'after', and is the time until which the tissue remodels",
+                "must be given if and only if state = 'after': the tissue remodels until then",
                 "time",
                 self.time,
             )
@@ -911,7 +911,10 @@ def fit(
             best = int(np.argmin([end.cost for end in minima]))
             again = partial(minimised, start=minima[best].x)
             (minima[best],) = on_cores({f"from the end of start {best + 1}": again})
-            log.info("sums of squares: %s", ", ".join(f"{2 * end.cost:.6g}" for end in minima))
+            log.info(
+                "sum of squares of each start: %s",
+                ", ".join(f"{2 * end.cost:.6g}" for end in minima),
+            )
             result = result_of(problem, minima)
             if profiles:
                 result = with_profiles(problem, result, on_cores)
