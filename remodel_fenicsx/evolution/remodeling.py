@@ -315,8 +315,8 @@ class RemodelingPass(Remodels):
 
     def distance(self) -> float:
         """Return max |A_pass - A| of the last pass, in squared link lengths."""
-        # A belongs to the cells before the pass, with 'extrapolated' to the cells at the start of the
-        # step. The distance is zero if a pass reproduces the cells, that is, if they are in
+        # A belongs to the cells before the pass, which with 'extrapolated' are those of the step's
+        # start. The distance is zero if a pass reproduces the cells, that is, if they are in
         # equilibrium with their own stress. NaN before the first pass.
         if not self.law.remodels or self._last_pass is None:
             return float("nan")
