@@ -16,7 +16,7 @@ from remodel_fenicsx.scene import scene_from_dict
 from tests.conftest import Cases, slowly
 from tests.mesh_files import TUBE, write_tube
 from tests.runs import columns_of, goes_on, last_row, simulated
-from tests.values import isotropic, ramped
+from tests.values import isotropic, ramp_to, ramped
 
 VOLUME = "lumen_expansion"
 EXACT = {"relative_tolerance": 1e-13}
@@ -85,7 +85,7 @@ LIMIT = {
 
 def test_a_limit_point_is_passed(caplog: pytest.LogCaptureFixture) -> None:
     """The largest pressure of a closed tube; it is stable at each volume, also beyond."""
-    load = {VOLUME: {"value": 12.0, "ramp": [[0.0, 0.0], [60.0, 1.0]]}}
+    load = {VOLUME: {"value": 12.0, "ramp": ramp_to(60.0)}}
     time = {"end": 60.0, "step": 1.0}
     values = tube("radial", load, **LIMIT | {"time": time})
     with simulated(scene_from_dict(values)) as (_, rows):

@@ -51,7 +51,7 @@ def test_a_tube_comes_back_to_its_loaded_radii_and_length(
     of = scene("radial", **(LOADED | VIRGIN | changes))
     caplog.set_level("INFO")
     found = unloaded(of, SELF)
-    runs = int(caplog.records[-1].getMessage().split("(")[1].split()[0])
+    runs = int(caplog.messages[-1].split("(")[1].split()[0])
     assert runs <= 7
     with made(found) as simulation:
         row = [step.row for step in simulation.steps()][-1]

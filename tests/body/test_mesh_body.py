@@ -25,9 +25,10 @@ from tests.command.test_run import run
 from tests.conftest import mpirun
 from tests.mesh_files import COUNTS, LENGTH, RADII, write_tube
 from tests.runs import simulated
+from tests.values import ramp_to, ramped
 
 LOADS = {
-    name: {"value": value, "ramp": [[0, 0], [2, 1]]}
+    name: {"value": value, "ramp": ramp_to(2)}
     for name, value in (("pressure", 2.0), ("elongation", 0.1))
 }
 TURN = np.array([[0.36, 0.48, -0.8], [-0.8, 0.6, 0.0], [0.48, 0.64, 0.6]])
@@ -262,13 +263,13 @@ def test_multigrid_of_degree_two_goes_on_with_its_copy_on_other_ranks(tmp_path: 
 
 
 def _outside(face: str = "outer", **more: Any) -> dict[str, Any]:
-    return {"kind": "pressure", "face": face, "value": 2.0, "ramp": [[0, 0], [2, 1]]} | more
+    return {"kind": "pressure", "face": face, "value": 2.0, "ramp": ramp_to(2)} | more
 
 
 def test_equal_pressures_inside_and_outside_compress_alike_everywhere(tube: Path) -> None:
     """In plane strain all of it is s times as wide: (mu (s^2 - 1) + 2 lambda ln s)/s^2 = -p, on plane facets too."""
     stiff = {"kind": "guided", "stiffness": 1e8}
-    pressure = {"value": 2.0, "ramp": [[0, 0], [2, 1]]}
+    pressure = {"value": 2.0, "ramp": ramp_to(2)}
     scene = scene_of(
         tube, material={"chain_density": 0.0}, remodeling={"law": "none"},
         loads={"pressure": pressure, "tissue": _outside()}, supports={"inlet": stiff, "outlet": stiff},
@@ -300,7 +301,7 @@ def test_a_bend_with_sliding_ends_carries_the_force_of_a_closed_tube(tmp_path: P
     length = bend * np.pi / 2
     file = write_tube(tmp_path / "bend.msh", degree=2, counts=counts, length=length, moved=moved)
     tables = {
-        "loads": {"pressure": {"value": 2.0, "ramp": [[0, 0], [10, 1]]}}, "material": {"repulsion": "axes"},
+        "loads": ramped(10, pressure=2.0), "material": {"repulsion": "axes"},
         "remodeling": {"law": "tensor", "coupling": "extrapolated"}, "time": {"end": 40.0, "step": 10.0},
         "output": {"fields": False},
     }  # fmt: skip

@@ -68,10 +68,7 @@ def test_growth_has_no_equilibrium_and_says_so(caplog: pytest.LogCaptureFixture)
     assert (
         last_row(wall("equilibrium", 4.0, GROWS | {"gain": 0.2}, COLUMNS))["natural_length"] > 5.0
     )
-    assert (
-        sum("turnover has not reached equilibrium" in record.message for record in caplog.records)
-        == 1
-    )
+    assert sum("turnover has not reached equilibrium" in line for line in caplog.messages) == 1
 
 
 @pytest.mark.parametrize(
@@ -217,11 +214,7 @@ def test_growth_that_does_not_come_to_rest_is_said_at_the_end(
     """Ever more slowly, or faster and faster; not of a wall that rests some time later, nor of a short run."""
     turnover = GROWS | {"gain": gain}
     rows_of(wall(480.0, 8.0, turnover, COLUMNS))
-    found = [
-        record.message
-        for record in caplog.records
-        if "has not reached equilibrium" in record.message
-    ]
+    found = [line for line in caplog.messages if "has not reached equilibrium" in line]
     assert len(found) == (0 if rests else 1)
     assert rests or (
         "decayed no faster than 1/t" in found[0] and "mechanobiological instability" in found[0]

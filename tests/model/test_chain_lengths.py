@@ -69,7 +69,7 @@ def run(name: str, unit: float, caplog: pytest.LogCaptureFixture) -> Run:
     with caplog.at_level(logging.INFO, "remodel_fenicsx"):
         simulation = Simulation(scene_in(unit, *CASES[name]), MPI.COMM_SELF)
         steps = list(simulation.steps())
-    said = [r.getMessage() for r in caplog.records if "compil" not in r.getMessage()]
+    said = [line for line in caplog.messages if "compil" not in line]
     rows = {
         column: np.array([step.row[column] for step in steps], dtype=float)
         for column in steps[0].row

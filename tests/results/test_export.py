@@ -21,8 +21,9 @@ from tests.conftest import Refused
 from tests.mesh_files import NAMES, write_tube
 from tests.results.test_stress_on_the_body import SCENES
 from tests.tables import rows
+from tests.values import ramp_to
 
-RAMP = [[0.0, 0.0], [3.0, 1.0]]
+RAMP = ramp_to(3.0)
 TUBE: dict[str, Any] = {
     "geometry": {"shape": "tube", "inner_radius": 1.0, "outer_radius": 3.0, "length": 1.0},
     "cells": {"initial": "random"},

@@ -15,8 +15,9 @@ from remodel_fenicsx.studies import sweep as study
 from tests.conftest import Cases, forked_children
 from tests.results.test_resume import assert_same
 from tests.runs import made
+from tests.values import ramp_to
 
-RAMP = [[0.0, 0.0], [3.0, 1.0]]
+RAMP = ramp_to(3.0)
 VALUES: dict[str, Any] = {
     "geometry": {"shape": "tube", "inner_radius": 1.0, "outer_radius": 3.0, "length": 1.0},
     "regions": {

@@ -20,7 +20,7 @@ from remodel_fenicsx.solver.newton import GuardedNewton, SolveFailure, Solution
 from remodel_fenicsx.solver.diagnosis import diagnose_failure
 from tests.locking_bodies import thick_tube
 from tests.runs import made
-from tests.values import ramped, isotropic
+from tests.values import isotropic, ramp_to, ramped
 
 LARGEST = (
     0.3018  # pressure of this tube: tests/reference/march.py, with the inner radius prescribed
@@ -88,7 +88,7 @@ def test_a_far_step_with_a_way_to_it_says_nothing(
         "geometry.outer_radius": 3.0,
         "supports.ends": "free",
     }
-    changes |= {"loads.elongation": {"value": 0.0, "ramp": [[0.0, 0.0], [1.0, 1.0]]}}
+    changes |= {"loads.elongation": {"value": 0.0, "ramp": ramp_to(1.0)}}
     looked, confirm = [], Continuation.repeat_in_substeps
     monkeypatch.setattr(
         Continuation,

@@ -22,6 +22,7 @@ from remodel_fenicsx.studies.fit import Problem, data_warnings, fit, minimised, 
 from tests.conftest import Refused, forked_children
 from tests.runs import last_row, rows_of
 from tests.tables import rows
+from tests.values import ramp_to, ramped
 
 ROOT, FITS = Path(__file__).parents[2], Path(__file__).with_name("fits")
 TRUTH = {"material.lame_mu": 3.0, "material.chain_density": 2e21, "remodeling.kappa": 0.05}
@@ -51,7 +52,7 @@ def inflated() -> list[dict[str, float]]:
         "time.step": 1.0,
         "loads.pressure.ramp": ramp,
     }
-    return rows_of(tube(**changes, **{"loads.elongation.ramp": [[0.0, 0.0], [1.0, 1.0]]}))
+    return rows_of(tube(**changes, **{"loads.elongation.ramp": ramp_to(1.0)}))
 
 
 @pytest.fixture(scope="module")
@@ -431,7 +432,7 @@ def stretched(network: dict[str, float]) -> Scene:
             **network,
         },
         cells={"initial": "aligned"},
-        loads={"force": {"value": 4184.0, "ramp": [[0.0, 0.0], [10.0, 1.0]]}},
+        loads=ramped(10.0, force=4184.0),
         remodeling={"law": "none"},
         time={"end": 10.0},
     )

@@ -22,6 +22,7 @@ from remodel_fenicsx.watch.stability import EquilibriumStability
 from tests import parts
 from tests.parts import cube, tube
 from tests.runs import made
+from tests.values import ramp_to
 
 DEMOS = Path(__file__).parents[2] / "demos"
 COLUMN = {"output.columns": ["negative_eigenvalues"]}
@@ -30,7 +31,7 @@ COLUMN = {"output.columns": ["negative_eigenvalues"]}
 def pushed_cube(force: float, **values: Any) -> Scene:
     """The demo's cube under a force that is there after three steps."""
     scene = read_scene(DEMOS / "cube.toml")
-    ramp = [[0.0, 0.0], [3.0, 1.0]]
+    ramp = ramp_to(3.0)
     return scene.with_values(
         {"loads.force.value": force, "loads.force.ramp": ramp, "time.end": 4.0, **values}
     )
@@ -187,9 +188,7 @@ def test_a_start_that_is_indefinite_is_told_apart(
     caplog.set_level(logging.INFO)
     run(pushed_cube(-20.0, **COLUMN, **{"remodeling.law": "none", "solver.unstable": "stop"}))
     assert not warnings(caplog)
-    assert (
-        sum("this is no loss of stability" in record.getMessage() for record in caplog.records) == 1
-    )
+    assert sum("this is no loss of stability" in line for line in caplog.messages) == 1
 
 
 # ---------------------------------------------------------------- refusals
@@ -207,7 +206,7 @@ def test_an_asymptote_of_the_pressure_is_a_limit_point() -> None:
     """Without chains p(r_i) rises to mu ln(R_o/R_i) and no further; on this mesh, a prism of eight sides, to more."""
     rising = {
         "loads.pressure.value": 8.0,
-        "loads.pressure.ramp": [[0.0, 0.0], [10.0, 1.0]],
+        "loads.pressure.ramp": ramp_to(10.0),
         "time.end": 10.0,
     }
     failure, last = refused(
