@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import logging
 from pathlib import Path
 from typing import Any
 
@@ -13,7 +12,7 @@ from remodel_fenicsx import SceneError
 from remodel_fenicsx.fem import jit
 from remodel_fenicsx.fem.assembly import integral
 from remodel_fenicsx.scene import scene_from_dict
-from tests.conftest import Cases, slowly
+from tests.conftest import Cases, slowly, warnings_of
 from tests.mesh_files import TUBE, write_tube
 from tests.runs import columns_of, goes_on, last_row, simulated
 from tests.values import isotropic, ramp_to, ramped
@@ -101,7 +100,7 @@ def test_a_limit_point_is_passed(caplog: pytest.LogCaptureFixture) -> None:
     assert (parabola(volume), radius, 1 + length) == pytest.approx((0.216, 1.66, 1.20), rel=5e-3)
     assert found["inner_radius"][-1] > 2.5 and (np.diff(found["pressure"][top:]) < 0).all()
     assert not found["negative_eigenvalues"].any()
-    assert not [record for record in caplog.records if record.levelno >= logging.WARNING]
+    assert not warnings_of(caplog)
 
 
 # ---------------------------------------------------------------- bodies of one's own

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import subprocess
 import sys
 from pathlib import Path
 from typing import Any
@@ -24,6 +23,7 @@ from remodel_fenicsx.simulation import Simulation
 from tests.command.test_run import run
 from tests.conftest import mpirun
 from tests.mesh_files import COUNTS, LENGTH, RADII, write_tube
+from tests.processes import ran
 from tests.runs import simulated
 from tests.values import ramp_to, ramped
 
@@ -237,7 +237,7 @@ def test_multigrid_of_degree_two_goes_on_with_its_copy_on_other_ranks(tmp_path: 
     }
     (tmp_path / "commands.json").write_text(json.dumps(commands))
     program = [sys.executable, str(Path(__file__).parents[1] / "commands.py"), str(tmp_path)]
-    done = subprocess.run(mpirun(3, *program), capture_output=True, text=True, timeout=300)
+    done = ran(mpirun(3, *program))
     assert json.loads((tmp_path / "codes.json").read_text()) == {
         "three": [0] * 3,
         "one": [0] * 3,

@@ -13,7 +13,7 @@ from remodel_fenicsx import Recording, Scene, Simulation
 from remodel_fenicsx.evolution.homeostasis import Homeostasis
 from remodel_fenicsx.running import resume, run
 from remodel_fenicsx.scene import scene_from_dict
-from tests.conftest import Case, slowly
+from tests.conftest import Case, slowly, warnings_of
 from tests.runs import SELF, simulated
 from tests.values import ANGLES, isotropic
 
@@ -231,7 +231,7 @@ def test_the_artery_says_nothing(caplog: pytest.LogCaptureFixture) -> None:
     """And takes about as many solves as it has steps, not one for each unit of time."""
     row = solved(Simulation(artery(), SELF))
     assert row["substeps"] <= 100
-    assert not [record for record in caplog.records if record.levelno >= logging.WARNING]
+    assert not warnings_of(caplog)
 
 
 # ---------------------------------------------------------------- scenes and records
