@@ -169,3 +169,10 @@ def case(cases: Cases) -> Case:
         return found
 
     return run
+
+
+@pytest.fixture(scope="module")
+def both_ranks(cases: Cases, request: pytest.FixtureRequest) -> list[tuple[dict, dict]]:
+    """What the cases of ON_ONE_AND_TWO_RANKS of a test file saved: on one rank, and on two."""
+    wanted = request.module.ON_ONE_AND_TWO_RANKS
+    return [*zip(*(cases(wanted, ranks) for ranks in (1, 2)), strict=True)]

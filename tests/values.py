@@ -9,6 +9,8 @@ from scipy.spatial.transform import Rotation
 
 ANGLES = ["fibre_angle_inner", "fibre_angle_middle", "fibre_angle_outer"]
 PAPER = "kuhl-holzapfel-2007"
+TURN = np.array([[0.36, 0.48, -0.8], [-0.8, 0.6, 0.0], [0.48, 0.64, 0.6]])
+"""A rotation that mixes all axes."""
 
 
 def ramp_to(end: float) -> list[list[float]]:

@@ -18,7 +18,6 @@ from remodel_fenicsx.body import tube
 from remodel_fenicsx.model.cells import structure_tensor
 from remodel_fenicsx.model.axes import cells_from_tensors, structure_tensors
 from remodel_fenicsx.running import resume
-from tests.conftest import Cases
 from tests.results.test_export import TUBE
 from tests.runs import SELF, last_row, made
 from tests.tables import of_csv, rows, unescaped
@@ -307,9 +306,9 @@ ON_ONE_AND_TWO_RANKS = [
 ]
 
 
-def test_one_and_two_ranks_have_the_same(cases: Cases) -> None:
+def test_one_and_two_ranks_have_the_same(both_ranks: Any) -> None:
     """Each element another angle."""
-    (one,), (two,) = (cases(ON_ONE_AND_TWO_RANKS, ranks) for ranks in (1, 2))
+    ((one, two),) = both_ranks
     assert np.ptp(one["n"][:, 0, 0], axis=0).max() > 0.4
     for name in (
         "n",

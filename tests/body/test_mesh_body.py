@@ -25,13 +25,12 @@ from tests.conftest import mpirun
 from tests.mesh_files import COUNTS, LENGTH, RADII, write_tube
 from tests.processes import ran
 from tests.runs import simulated
-from tests.values import ramp_to, ramped
+from tests.values import TURN, ramp_to, ramped
 
 LOADS = {
     name: {"value": value, "ramp": ramp_to(2)}
     for name, value in (("pressure", 2.0), ("elongation", 0.1))
 }
-TURN = np.array([[0.36, 0.48, -0.8], [-0.8, 0.6, 0.0], [0.48, 0.64, 0.6]])
 SHIFT = np.array([10.0, -3.0, 7.0])
 FREE = {"kind": "free"}
 

@@ -19,10 +19,9 @@ from tests.body.test_natural import layers, scene
 from tests.body.test_stresses import NAMES
 from tests.runs import goes_on, last_row, made
 from tests.tables import rows, values
-from tests.values import ramp_to
+from tests.values import TURN, ramp_to
 
 SELF = MPI.COMM_SELF
-TURN = np.array([[0.36, 0.48, -0.8], [-0.8, 0.6, 0.0], [0.48, 0.64, 0.6]])
 MEDIA, ADVENTITIA = {"circumferential": 1.05, "axial": 0.95}, {"axial": 1.1}
 
 

@@ -18,7 +18,7 @@ from remodel_fenicsx.fem import jit
 from remodel_fenicsx.model.cells import structure_tensor
 from remodel_fenicsx.results.columns import Measurement
 from remodel_fenicsx.scene import scene_from_dict
-from tests.conftest import Cases, Refused, slowly
+from tests.conftest import Refused, slowly
 from tests.reference.radial import solve_radial
 from tests.runs import columns_of, made
 from tests.tables import rows as table, values as values_of
@@ -307,10 +307,9 @@ ON_ONE_AND_TWO_RANKS = [
 
 
 @pytest.fixture(scope="module")
-def on_one_and_two_ranks(cases: Cases) -> dict[str, tuple[dict[str, Any], dict[str, Any]]]:
+def on_one_and_two_ranks(both_ranks: Any) -> dict[str, tuple[dict[str, Any], dict[str, Any]]]:
     """What each of them saves."""
-    found = (cases(ON_ONE_AND_TWO_RANKS, ranks) for ranks in (1, 2))
-    return dict(zip(TWICE, zip(*found, strict=True), strict=True))
+    return dict(zip(TWICE, both_ranks, strict=True))
 
 
 @pytest.mark.parametrize("name", TWICE)

@@ -13,10 +13,9 @@ from remodel_fenicsx.body.tube import whole_tube
 from remodel_fenicsx.results.recording import unit_of
 from tests.mesh_files import COUNTS, LENGTH, RADII, write_tube
 from tests.runs import SELF, last_row, rows_of
-from tests.values import ramp_to, ramped
+from tests.values import TURN, ramp_to, ramped
 
 ENDS = ["support_force_inlet", "support_force_outlet"]
-TURN = np.array([[0.36, 0.48, -0.8], [-0.8, 0.6, 0.0], [0.48, 0.64, 0.6]])
 LAW = {"law": "tensor", "coupling": "staggered"}
 
 

@@ -12,6 +12,7 @@ from remodel_fenicsx.simulation import Simulation
 from remodel_fenicsx.solver.continuation import StepFailure
 from remodel_fenicsx.solver.newton import Convergence
 from tests import parts
+from tests.body.test_cube import closed_form_angle
 from tests.parts import cube
 from tests.reference.radial import RadialMaterial, Tube
 from tests.values import ramp_to
@@ -86,8 +87,7 @@ def test_weak_tension_remodels_as_strong_tension_does() -> None:
     """The threshold is no load of anybody's: a stress of 1e-6 of the matrix's stiffness is a tension."""
     scene = preset_scene(PAPER, "cube").with_values({"loads.force.value": 3e-5, "time.end": 2.0})
     _, second = Simulation(scene).steps()
-    s = 1 - np.exp(-0.025)
-    expected = np.degrees(np.arctan2(np.sqrt(2) * (1 - s), 1 - s + np.sqrt(3) * s))
+    expected = closed_form_angle(0.025, 1.0)
     assert second.row["mean_fibre_angle"] == pytest.approx(expected, abs=1e-8)
 
 
@@ -210,6 +210,5 @@ def test_chains_near_their_contour_length_are_solved_to_rounding() -> None:
     steps = list(Simulation(scene).steps())
     assert len(steps) == 12 and steps[-1].row["force"] == 10.0
     assert all(step.row["max_chain_extension"] < 1.0 for step in steps)
-    s = 1 - np.exp(-0.025 * 11.0)
-    expected = np.degrees(np.arctan2(np.sqrt(2) * (1 - s), 1 - s + np.sqrt(3) * s))
+    expected = closed_form_angle(0.025, 11.0)
     assert steps[-1].row["mean_fibre_angle"] == pytest.approx(expected, abs=1e-8)

@@ -13,7 +13,7 @@ from remodel_fenicsx.body import SHAPES
 from remodel_fenicsx.scene import Scene, scene_from_dict
 from remodel_fenicsx.system import NOTICE
 from remodel_fenicsx.watch.warnings import VolumeLoss
-from tests.conftest import Cases, slowly
+from tests.conftest import slowly
 from tests.runs import rows_of, simulated
 from tests.values import PAPER, isotropic, ramp_to, ramped
 
@@ -155,9 +155,9 @@ WHOLE = {
 ON_ONE_AND_TWO_RANKS = [{"scene": WHOLE, "divisions": [8, 4, 1]}]
 
 
-def test_one_and_two_ranks_agree(cases: Cases) -> None:
+def test_one_and_two_ranks_agree(both_ranks: Any) -> None:
     """Of random cells on the whole tube: forces, shares and angles."""
-    (one,), (two,) = (cases(ON_ONE_AND_TWO_RANKS, ranks) for ranks in (1, 2))
+    ((one, two),) = both_ranks
     for name in COLUMNS:
         np.testing.assert_allclose(two[name], one[name], rtol=1e-10)
 
