@@ -152,7 +152,7 @@ def test_pages_are_short() -> None:
 
 
 def test_no_file_has_marks_of_a_merge_conflict() -> None:
-    assert subprocess.run(["git", "grep", "-IlE", "^(<{7}|>{7}) "], cwd=ROOT).returncode == 1
+    assert ran(["git", "grep", "-IlE", "^(<{7}|>{7}) "], cwd=ROOT).returncode == 1
 
 
 LINK = re.compile(r"\]\((?!\w+:|#)([^)#\s]+)[^)]*\)")
