@@ -5,6 +5,7 @@ from __future__ import annotations
 import fcntl
 import hashlib
 import json
+import logging
 import os
 import shutil
 import subprocess
@@ -39,6 +40,11 @@ def slowly(*cases: Any) -> list[Any]:
         pytest.param(*(one if isinstance(one, tuple) else (one,)), marks=pytest.mark.slow)
         for one in cases
     ]
+
+
+def warnings_of(caplog: pytest.LogCaptureFixture) -> list[str]:
+    """What has been logged as a warning, or as worse."""
+    return [record.getMessage() for record in caplog.records if record.levelno >= logging.WARNING]
 
 
 @contextmanager
@@ -163,3 +169,10 @@ def case(cases: Cases) -> Case:
         return found
 
     return run
+
+
+@pytest.fixture(scope="module")
+def both_ranks(cases: Cases, request: pytest.FixtureRequest) -> list[tuple[dict, dict]]:
+    """What the cases of ON_ONE_AND_TWO_RANKS of a test file saved: on one rank, and on two."""
+    wanted = request.module.ON_ONE_AND_TWO_RANKS
+    return [*zip(*(cases(wanted, ranks) for ranks in (1, 2)), strict=True)]

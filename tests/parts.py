@@ -25,6 +25,7 @@ from remodel_fenicsx.schema.settings import Cells, Material, Remodeling
 from remodel_fenicsx.solver.equilibrium import Equilibrium
 from remodel_fenicsx.solver.newton import GuardedNewton, Solution
 from remodel_fenicsx.state import State, UnitCells
+from tests.values import ramped
 
 MATERIAL = Material()
 TIGHT = Solver(absolute_tolerance=1e-11, relative_tolerance=1e-13)
@@ -84,7 +85,7 @@ def pulled_cube(end: float, **tables: Any) -> Scene:
         geometry={"shape": "cube"},
         mesh={"refinement": 2},
         cells={"initial": "random"},
-        loads={"force": {"value": 8.0, "ramp": [[0.0, 0.0], [4.0, 1.0]]}},
+        loads=ramped(4.0, force=8.0),
         remodeling={"kappa": 0.1},
         time={"end": end},
         **tables,

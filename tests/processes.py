@@ -18,6 +18,11 @@ COMPILER, TICKS = (
 CHILDREN, GROUP, SESSION = 1, 2, 3  # which of the numbers of a process, behind its state
 
 
+def ran(command: Any, timeout: float = 300, **options: Any) -> subprocess.CompletedProcess[str]:
+    """A command at its end, with what it has said."""
+    return subprocess.run(command, capture_output=True, text=True, timeout=timeout, **options)
+
+
 def members(number: int, kind: int = SESSION) -> dict[int, str]:
     """Number and name of every process of a session, a group or a parent, that has not ended."""
     found = {}

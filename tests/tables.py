@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import csv
 import tomllib
 from pathlib import Path
 from typing import Any
@@ -17,6 +18,11 @@ def rows(test: str, name: str) -> list[list[str]]:
         for line in lines
         if not line.startswith("#")
     ]
+
+
+def of_csv(path: Path) -> list[dict[str, str]]:
+    """Rows of a CSV file."""
+    return list(csv.DictReader(path.read_text(encoding="utf-8").splitlines()))
 
 
 def values(text: str) -> dict[str, Any]:

@@ -9,13 +9,18 @@ from scipy.spatial.transform import Rotation
 
 ANGLES = ["fibre_angle_inner", "fibre_angle_middle", "fibre_angle_outer"]
 PAPER = "kuhl-holzapfel-2007"
+TURN = np.array([[0.36, 0.48, -0.8], [-0.8, 0.6, 0.0], [0.48, 0.64, 0.6]])
+"""A rotation that mixes all axes."""
+
+
+def ramp_to(end: float) -> list[list[float]]:
+    """A ramp from nothing to the whole load."""
+    return [[0.0, 0.0], [end, 1.0]]
 
 
 def ramped(end: float, **values: float) -> dict[str, Any]:
     """Loads that rise to their values until a time."""
-    return {
-        name: {"value": value, "ramp": [[0.0, 0.0], [end, 1.0]]} for name, value in values.items()
-    }
+    return {name: {"value": value, "ramp": ramp_to(end)} for name, value in values.items()}
 
 
 def isotropic(

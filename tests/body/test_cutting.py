@@ -26,6 +26,7 @@ from remodel_fenicsx.model.residual_stress import (
     principal_stresses,
 )
 from tests.runs import last_row, made
+from tests.values import ramp_to
 
 
 def scene(preset: str = "consistent", kinematics: str = "radial", **changes: Any) -> Scene:
@@ -34,9 +35,9 @@ def scene(preset: str = "consistent", kinematics: str = "radial", **changes: Any
     values |= {
         "output.columns": ["opening_angle"],
         "output.fields": False,
-        "loads.pressure.ramp": [[0, 0], [5, 1]],
+        "loads.pressure.ramp": ramp_to(5),
     }
-    values |= {"loads.elongation.ramp": [[0, 0], [5, 1]], "time.end": 20.0}
+    values |= {"loads.elongation.ramp": ramp_to(5), "time.end": 20.0}
     return preset_scene(preset, "tube").with_values(values | changes)
 
 

@@ -19,13 +19,14 @@ from pydantic import Field
 from remodel_fenicsx import Recording, Scene, SceneError, Simulation, extend, parts, run
 from remodel_fenicsx.parts import Cube, Domain, Remodeling
 from tests.runs import rows_of, simulated
+from tests.values import ramp_to, ramped
 
 KAPPA = 0.1
 SCENE: dict[str, Any] = {
     "preset": "kuhl-holzapfel-2007",
     "geometry": {"shape": "cube"},
     "model": {"kinematics": "point"},
-    "loads": {"force": {"value": 10.0, "ramp": [[0.0, 0.0], [2.0, 1.0]]}},
+    "loads": ramped(2.0, force=10.0),
     "remodeling": {"kappa": KAPPA},
     "time": {"end": 4.0},
 }
@@ -62,9 +63,7 @@ def test_a_chain_law(monkeypatch: pytest.MonkeyPatch) -> None:
         "spring",
         extend.Chain(lambda r, L: g * r**2 / 2, lambda r, L: g, locks=False),
     )
-    pulled = scene(loads={"force": {"value": 30.0, "ramp": [[0.0, 0.0], [4.0, 1.0]]}}).with_values(
-        ELASTIC
-    )
+    pulled = scene(loads=ramped(4.0, force=30.0)).with_values(ELASTIC)
     springs = pulled.with_values({"material.chain": "spring"})
     with simulated(springs) as (simulation, found):
         squared = simulation.stepper.coupling.equilibrium.squared_lengths()
@@ -278,7 +277,7 @@ def test_a_load(monkeypatch: pytest.MonkeyPatch) -> None:
         "weight",
         extend.LoadKind(add_weight, "weight along z per reference volume", density),
     )
-    ramp = [[0.0, 0.0], [2.0, 1.0]]
+    ramp = ramp_to(2.0)
     heavy = whole(geometry={"length_unit": "m"}, loads={"force": {"value": 0.0, "ramp": ramp},
                                                         "weight": {"value": "0.02 kN/m^3", "ramp": ramp}})  # fmt: skip
     assert heavy.loads["weight"].value == pytest.approx(20.0)

@@ -18,10 +18,9 @@ from remodel_fenicsx.body import tube
 from remodel_fenicsx.model.cells import structure_tensor
 from remodel_fenicsx.model.axes import cells_from_tensors, structure_tensors
 from remodel_fenicsx.running import resume
-from tests.conftest import Cases
 from tests.results.test_export import TUBE
 from tests.runs import SELF, last_row, made
-from tests.tables import rows, unescaped
+from tests.tables import of_csv, rows, unescaped
 
 R0 = 0.9
 
@@ -67,11 +66,6 @@ def tensors_of(one: Scene) -> np.ndarray:
         return found
 
 
-def rows_of(path: Path) -> list[dict[str, str]]:
-    """Of a table."""
-    return list(csv.DictReader(path.read_text().splitlines()))
-
-
 def table(path: Path, rows: list[dict[str, Any]]) -> Path:
     """A file of rows."""
     with path.open("w", newline="") as file:
@@ -84,7 +78,7 @@ def table(path: Path, rows: list[dict[str, Any]]) -> Path:
 def expected(path: Path) -> np.ndarray:
     """A of a table, scaled to the trace r0^2."""
     names = [f"structure_tensor_{i}{j}" for i in "xyz" for j in "xyz"]
-    tensors = np.array([[float(row[name]) for name in names] for row in rows_of(path)]).reshape(
+    tensors = np.array([[float(row[name]) for name in names] for row in of_csv(path)]).reshape(
         -1, 1, 3, 3
     )
     return R0**2 * tensors / np.trace(tensors, axis1=2, axis2=3)[..., None, None]
@@ -113,7 +107,7 @@ def test_rows_belong_to_numbers_or_else_to_places(
     exported: Callable[[str], Path], tmp_path: Path
 ) -> None:
     """Shuffled rows; six numbers in place of nine; places a little beside those of the elements."""
-    table_rows = rows_of(exported("csv"))
+    table_rows = of_csv(exported("csv"))
     wanted = tensors_of(scene(exported("csv")))
     order = np.random.default_rng(2).permutation(len(table_rows))
     np.testing.assert_allclose(
@@ -155,7 +149,7 @@ def test_tables_are_read_however_they_are_written(
     dialect: str, exported: Callable[[str], Path], tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
     """Rows of another order go by their places: another angle in each. The log says what was found."""
-    rows = rows_of(exported("csv"))[::-1]
+    rows = of_csv(exported("csv"))[::-1]
     plain = "x,y,z,angle\n" + "".join(
         f"{r['x']},{r['y']},{r['z']},{2.5 * n}\n" for n, r in enumerate(rows)
     )
@@ -312,9 +306,9 @@ ON_ONE_AND_TWO_RANKS = [
 ]
 
 
-def test_one_and_two_ranks_have_the_same(cases: Cases) -> None:
+def test_one_and_two_ranks_have_the_same(both_ranks: Any) -> None:
     """Each element another angle."""
-    (one,), (two,) = (cases(ON_ONE_AND_TWO_RANKS, ranks) for ranks in (1, 2))
+    ((one, two),) = both_ranks
     assert np.ptp(one["n"][:, 0, 0], axis=0).max() > 0.4
     for name in (
         "n",

@@ -15,7 +15,6 @@ from mpi4py import MPI
 
 from remodel_fenicsx.body.axes import MOST_UNDEFINED, UndefinedAxes
 from tests import own_bodies, parts
-from tests.conftest import Cases
 from tests.own_bodies import KnownBody, apart, bent, elliptic, fork, found, ring, straight
 
 TORUS = bent((1.0, 2.0), bend=6.0, angle=np.pi / 3)
@@ -131,8 +130,8 @@ def test_axes_are_a_right_handed_frame_and_a_turned_body_has_turned_ones() -> No
 ON_ONE_AND_TWO_RANKS = [{"scene": "a bend with legs"}]
 
 
-def test_two_ranks_give_the_same(cases: Cases) -> None:
-    (one,), (two,) = (cases(ON_ONE_AND_TWO_RANKS, ranks) for ranks in (1, 2))
+def test_two_ranks_give_the_same(both_ranks: list[tuple[dict, dict]]) -> None:
+    ((one, two),) = both_ranks
     assert {"axes", "depth", "station", "thickness", "nodal_depth"} == set(one)
     for name, values in one.items():
         np.testing.assert_allclose(two[name], values, atol=1e-8, err_msg=name)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import logging
 from pathlib import Path
 from typing import Any
 
@@ -13,10 +12,10 @@ from remodel_fenicsx import SceneError
 from remodel_fenicsx.fem import jit
 from remodel_fenicsx.fem.assembly import integral
 from remodel_fenicsx.scene import scene_from_dict
-from tests.conftest import Cases, slowly
+from tests.conftest import slowly, warnings_of
 from tests.mesh_files import TUBE, write_tube
 from tests.runs import columns_of, goes_on, last_row, simulated
-from tests.values import isotropic, ramped
+from tests.values import isotropic, ramp_to, ramped
 
 VOLUME = "lumen_expansion"
 EXACT = {"relative_tolerance": 1e-13}
@@ -85,11 +84,10 @@ LIMIT = {
 
 def test_a_limit_point_is_passed(caplog: pytest.LogCaptureFixture) -> None:
     """The largest pressure of a closed tube; it is stable at each volume, also beyond."""
-    load = {VOLUME: {"value": 12.0, "ramp": [[0.0, 0.0], [60.0, 1.0]]}}
+    load = {VOLUME: {"value": 12.0, "ramp": ramp_to(60.0)}}
     time = {"end": 60.0, "step": 1.0}
     values = tube("radial", load, **LIMIT | {"time": time})
-    with simulated(scene_from_dict(values)) as (_, rows):
-        found = {name: np.array([row[name] for row in rows]) for name in rows[0]}
+    found = columns_of(values)
     top = int(found["pressure"].argmax())
     near = slice(top - 1, top + 2)
     parabola = np.poly1d(np.polyfit(found[VOLUME][near], found["pressure"][near], 2))
@@ -101,7 +99,7 @@ def test_a_limit_point_is_passed(caplog: pytest.LogCaptureFixture) -> None:
     assert (parabola(volume), radius, 1 + length) == pytest.approx((0.216, 1.66, 1.20), rel=5e-3)
     assert found["inner_radius"][-1] > 2.5 and (np.diff(found["pressure"][top:]) < 0).all()
     assert not found["negative_eigenvalues"].any()
-    assert not [record for record in caplog.records if record.levelno >= logging.WARNING]
+    assert not warnings_of(caplog)
 
 
 # ---------------------------------------------------------------- bodies of one's own
@@ -172,7 +170,7 @@ ON_ONE_AND_TWO_RANKS = [
 ]
 
 
-def test_one_and_two_ranks_agree(cases: Cases) -> None:
-    for one, two in zip(*(cases(ON_ONE_AND_TWO_RANKS, ranks) for ranks in (1, 2)), strict=True):
+def test_one_and_two_ranks_agree(both_ranks: Any) -> None:
+    for one, two in both_ranks:
         for name in ("u", "l", "pressure", VOLUME):
             np.testing.assert_allclose(two[name], one[name], rtol=1e-9, atol=1e-9)

@@ -15,7 +15,7 @@ from remodel_fenicsx import Recording, Scene, SceneError, Simulation, cli, read_
 from remodel_fenicsx.body.mesh_file import read_mesh
 from remodel_fenicsx.results.recording import RunLock
 from remodel_fenicsx.unloading import NoUnloadedShape
-from tests.conftest import Cases, Refused
+from tests.conftest import Refused
 from tests.body.test_natural import scene
 from tests.mesh_files import TUBE, write_tube
 from tests.runs import last_row, made, simulated
@@ -51,7 +51,7 @@ def test_a_tube_comes_back_to_its_loaded_radii_and_length(
     of = scene("radial", **(LOADED | VIRGIN | changes))
     caplog.set_level("INFO")
     found = unloaded(of, SELF)
-    runs = int(caplog.records[-1].getMessage().split("(")[1].split()[0])
+    runs = int(caplog.messages[-1].split("(")[1].split()[0])
     assert runs <= 7
     with made(found) as simulation:
         row = [step.row for step in simulation.steps()][-1]
@@ -145,9 +145,9 @@ def test_every_node_of_an_own_body_comes_back(
 ON_ONE_AND_TWO_RANKS = [{"scene": own_values(str(TUBE), 0.6, elongation=0.01)}]
 
 
-def test_two_ranks_find_the_same(cases: Cases) -> None:
+def test_two_ranks_find_the_same(both_ranks: Any) -> None:
     """Nodes of the body, and where its points lie before."""
-    (one,), (two,) = (cases(ON_ONE_AND_TWO_RANKS, ranks) for ranks in (1, 2))
+    ((one, two),) = both_ranks
     for name in ("x", "u"):
         np.testing.assert_allclose(
             two[name], one[name], rtol=0, atol=1e-8

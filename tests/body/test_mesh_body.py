@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import subprocess
 import sys
 from pathlib import Path
 from typing import Any
@@ -24,13 +23,14 @@ from remodel_fenicsx.simulation import Simulation
 from tests.command.test_run import run
 from tests.conftest import mpirun
 from tests.mesh_files import COUNTS, LENGTH, RADII, write_tube
+from tests.processes import ran
 from tests.runs import simulated
+from tests.values import TURN, ramp_to, ramped
 
 LOADS = {
-    name: {"value": value, "ramp": [[0, 0], [2, 1]]}
+    name: {"value": value, "ramp": ramp_to(2)}
     for name, value in (("pressure", 2.0), ("elongation", 0.1))
 }
-TURN = np.array([[0.36, 0.48, -0.8], [-0.8, 0.6, 0.0], [0.48, 0.64, 0.6]])
 SHIFT = np.array([10.0, -3.0, 7.0])
 FREE = {"kind": "free"}
 
@@ -236,7 +236,7 @@ def test_multigrid_of_degree_two_goes_on_with_its_copy_on_other_ranks(tmp_path: 
     }
     (tmp_path / "commands.json").write_text(json.dumps(commands))
     program = [sys.executable, str(Path(__file__).parents[1] / "commands.py"), str(tmp_path)]
-    done = subprocess.run(mpirun(3, *program), capture_output=True, text=True, timeout=300)
+    done = ran(mpirun(3, *program))
     assert json.loads((tmp_path / "codes.json").read_text()) == {
         "three": [0] * 3,
         "one": [0] * 3,
@@ -262,13 +262,13 @@ def test_multigrid_of_degree_two_goes_on_with_its_copy_on_other_ranks(tmp_path: 
 
 
 def _outside(face: str = "outer", **more: Any) -> dict[str, Any]:
-    return {"kind": "pressure", "face": face, "value": 2.0, "ramp": [[0, 0], [2, 1]]} | more
+    return {"kind": "pressure", "face": face, "value": 2.0, "ramp": ramp_to(2)} | more
 
 
 def test_equal_pressures_inside_and_outside_compress_alike_everywhere(tube: Path) -> None:
     """In plane strain all of it is s times as wide: (mu (s^2 - 1) + 2 lambda ln s)/s^2 = -p, on plane facets too."""
     stiff = {"kind": "guided", "stiffness": 1e8}
-    pressure = {"value": 2.0, "ramp": [[0, 0], [2, 1]]}
+    pressure = {"value": 2.0, "ramp": ramp_to(2)}
     scene = scene_of(
         tube, material={"chain_density": 0.0}, remodeling={"law": "none"},
         loads={"pressure": pressure, "tissue": _outside()}, supports={"inlet": stiff, "outlet": stiff},
@@ -300,7 +300,7 @@ def test_a_bend_with_sliding_ends_carries_the_force_of_a_closed_tube(tmp_path: P
     length = bend * np.pi / 2
     file = write_tube(tmp_path / "bend.msh", degree=2, counts=counts, length=length, moved=moved)
     tables = {
-        "loads": {"pressure": {"value": 2.0, "ramp": [[0, 0], [10, 1]]}}, "material": {"repulsion": "axes"},
+        "loads": ramped(10, pressure=2.0), "material": {"repulsion": "axes"},
         "remodeling": {"law": "tensor", "coupling": "extrapolated"}, "time": {"end": 40.0, "step": 10.0},
         "output": {"fields": False},
     }  # fmt: skip

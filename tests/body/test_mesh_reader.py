@@ -23,8 +23,9 @@ from remodel_fenicsx.scene import scene_from_dict
 from tests.body.test_lumen import tube
 from tests.mesh_files import write_tube
 from tests.runs import last_row
+from tests.values import ramped
 
-LOADS = {"pressure": {"value": 2.0, "ramp": [[0, 0], [2, 1]]}}
+LOADS = ramped(2, pressure=2.0)
 
 
 def converted(source: Path, ending: str, **arrays: Any) -> Path:

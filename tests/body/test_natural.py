@@ -12,6 +12,7 @@ from remodel_fenicsx import Scene, preset_scene
 from remodel_fenicsx.model.residual_stress import ClosedRing, Layer, close_ring
 from remodel_fenicsx.results.columns import Measurement
 from tests.runs import last_row, made, rows_of, simulated
+from tests.values import TURN
 
 RADII = (1.0, 1.3)
 
@@ -177,8 +178,7 @@ def test_a_rotation_of_the_natural_state_changes_nothing() -> None:
         )
         before = equilibrium.stored_energy()
         values = simulation.quadrature.values(function, (3, 3))
-        turn = np.array([[0.36, 0.48, -0.8], [-0.8, 0.6, 0.0], [0.48, 0.64, 0.6]])
-        values[:] = values @ turn
+        values[:] = values @ TURN
         assert equilibrium.stored_energy() == pytest.approx(before, rel=1e-12)
         values[:] = values * np.array([1.1, 1.0, 1.0])
         assert equilibrium.stored_energy() != pytest.approx(before, rel=1e-3)

@@ -19,9 +19,9 @@ from tests.body.test_natural import layers, scene
 from tests.body.test_stresses import NAMES
 from tests.runs import goes_on, last_row, made
 from tests.tables import rows, values
+from tests.values import TURN, ramp_to
 
 SELF = MPI.COMM_SELF
-TURN = np.array([[0.36, 0.48, -0.8], [-0.8, 0.6, 0.0], [0.48, 0.64, 0.6]])
 MEDIA, ADVENTITIA = {"circumferential": 1.05, "axial": 0.95}, {"axial": 1.1}
 
 
@@ -32,8 +32,8 @@ def test_all_kinematics_agree_with_one_radius(law: str, kinematics: list[str]) -
     """Radii and stresses, within the facets of their elements. Cells turn where kernels compile faster."""
     few = {
         "time.end": 6.0,
-        "loads.pressure.ramp": [[0, 0], [5, 1]],
-        "loads.elongation.ramp": [[0, 0], [5, 1]],
+        "loads.pressure.ramp": ramp_to(5),
+        "loads.elongation.ramp": ramp_to(5),
     }
     names = ["inner_radius", "outer_radius", "fibre_angle_outer", "mean_hoop_stress", *NAMES]
     ends = []
@@ -66,7 +66,7 @@ def two_layers(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 def own_body(file: Path, elongation: float, **tables: Any) -> Any:
     """Two layers of a file with a prestretch each, let go and elongated."""
-    ramp = [[0.0, 0.0], [1.0, 1.0]]
+    ramp = ramp_to(1.0)
     values: dict[str, Any] = {
         "geometry": {"shape": "mesh", "file": str(file)}, "cells": {"initial": "isotropic"},
         "natural": {"layers": layers(("media", MEDIA), ("adventitia", ADVENTITIA))},

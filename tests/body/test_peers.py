@@ -9,12 +9,13 @@ import pytest
 
 from remodel_fenicsx import preset_scene
 from tests.runs import rows_of
+from tests.values import ramp_to
 
 PRESSURES = (1.2, 2.4, 3.6, 4.8)
 PASSIVE = {
     "cells.initial": "isotropic", "remodeling.law": "none", "model.kinematics": "radial",
     "material.lame_lambda": 31030.0, "mesh.degree": 2, "mesh.refinement": 4, "mesh.formulation": "auto",
-    "loads.pressure.ramp": [[0.0, 0.0], [4.0, 1.0]], "loads.elongation.ramp": [[0.0, 0.0], [1.0, 1.0]],
+    "loads.pressure.ramp": ramp_to(4.0), "loads.elongation.ramp": ramp_to(1.0),
     "time.end": 4.0,
 }  # fmt: skip
 FORCES = {"output.columns": ["inner_radius", "axial_force"]}

@@ -16,9 +16,10 @@ from remodel_fenicsx.report import write_report
 from tests.mesh_files import write_tube
 from tests.runs import SELF, goes_on, last_row, rows_of
 from tests.tables import rows, values
+from tests.values import ramp_to
 
 GEL = Path(__file__).parents[2] / "demos" / "gel"
-RAMP = [[0.0, 0.0], [2.0, 1.0]]
+RAMP = ramp_to(2.0)
 
 
 @pytest.fixture(scope="module")

@@ -23,7 +23,7 @@ from tests.reference.radial import (
 )
 from tests.parts import rotation, tube
 from tests.runs import last_row, simulated
-from tests.values import ramped
+from tests.values import ramp_to, ramped
 
 ELEMENTS, END = 8, 30.0
 MIDDLE = slice(9, 15)  # three Gauss points of each of the two elements at the middle radius
@@ -65,7 +65,7 @@ def test_at_the_faces_they_converge_to_the_traction_and_the_closed_form() -> Non
     short = {
         "remodeling.law": "none",
         "time.end": 5.0,
-        "loads.pressure.ramp": [[0.0, 0.0], [5.0, 1.0]],
+        "loads.pressure.ramp": ramp_to(5.0),
     }
     short |= {"loads.elongation.ramp": short["loads.pressure.ramp"]}
     fine = solve_radial(end=5.0, ramp_time=5.0, law="none")
@@ -113,7 +113,7 @@ def test_a_half_plane_has_the_same() -> None:
     """The sector and the whole tube too: tests/body/test_natural_bodies.py."""
     short = {
         "time.end": 3.0,
-        "loads.pressure.ramp": [[0.0, 0.0], [3.0, 1.0]],
+        "loads.pressure.ramp": ramp_to(3.0),
         "loads.pressure.value": 1.5,
     }
     short |= {"remodeling.law": "none"}

@@ -13,6 +13,7 @@ from remodel_fenicsx.body.reductions import choice
 from remodel_fenicsx.body.tube import whole_tube
 from tests.body.test_natural import scene
 from tests.runs import last_row, made
+from tests.values import ramp_to
 
 SELF = MPI.COMM_SELF
 
@@ -52,8 +53,8 @@ def test_kinematics_agree_on_springs() -> None:
     """Of fixed direction, square to the face: on one radius, a half-plane, a quarter and the whole tube."""
     few = {
         "time.end": 6.0,
-        "loads.pressure.ramp": [[0, 0], [5, 1]],
-        "loads.elongation.ramp": [[0, 0], [5, 1]],
+        "loads.pressure.ramp": ramp_to(5),
+        "loads.elongation.ramp": ramp_to(5),
     }
     ends = {
         name: last_row(surrounded(2.0, name, **few))
@@ -73,8 +74,8 @@ def test_springs_along_the_wall_need_what_shows_them() -> None:
     """Sections do not stay plane: the half-plane and the whole tube agree, one radius is refused, with its reason."""
     few = {
         "time.end": 2.0,
-        "loads.pressure.ramp": [[0, 0], [2, 1]],
-        "loads.elongation.ramp": [[0, 0], [2, 1]],
+        "loads.pressure.ramp": ramp_to(2),
+        "loads.elongation.ramp": ramp_to(2),
     }
     few |= {"time.step": 1.0}
     assert choice(surrounded(2.0, "auto", 1.0)).name == "axisymmetric"

@@ -13,6 +13,7 @@ from scipy.optimize import fsolve
 
 from remodel_fenicsx.scene.scene import preset_scene
 from tests.conftest import Case, slowly
+from tests.values import ramped
 
 L, A_P, DENSITY, LAMBDA, MU, KAPPA = 1.594, 1.365, 2.0e21, 27.293, 3.103, 0.025
 C_NETWORK = 1.381e-23 * 310.0 * DENSITY / (4 * A_P)
@@ -92,7 +93,7 @@ def test_only_the_stress_as_printed_ends_near_140_percent(case: Case) -> None:
             "preset": "kuhl-holzapfel-2007",
             "geometry": {"shape": "cube"},
             "material": preset.material.model_dump() | {"energy_factor": factor},
-            "loads": {"force": {"value": 30.0, "ramp": [[0.0, 0.0], [12.0, 1.0]]}},
+            "loads": ramped(12.0, force=30.0),
             "time": {"end": 150.0, "step": 3.0},
         }
         final[factor] = case(scene)["mean_stretch"][-1]

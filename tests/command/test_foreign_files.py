@@ -10,7 +10,6 @@ import io
 import json
 import os
 import shutil
-import subprocess
 import sys
 import tomllib
 import zipfile
@@ -34,6 +33,7 @@ from remodel_fenicsx.schema.text import LARGEST, MOST_PARTS
 from tests.command.test_run import demo, refusal_of, run
 from tests.forks import forked
 from tests.parts import pulled_cube
+from tests.processes import ran
 from tests.runs import made
 
 PROJECT = Path(__file__).parents[2]
@@ -415,9 +415,7 @@ def test_the_working_folder_runs_nothing_and_sets_nothing(tmp_path: Path) -> Non
     words = "ensemble scene.toml --seeds 2 --jobs 1 -o out -q".split()
     command = [sys.executable, PROJECT / "bin" / "remodel-fenicsx", *words]
     own = {"PETSC_OPTIONS": "-remodel_snes_monitor ascii:the-users-own::append"}
-    done = subprocess.run(
-        command, cwd=tmp_path, env=os.environ | own, capture_output=True, text=True
-    )
+    done = ran(command, cwd=tmp_path, env=os.environ | own)
     assert (done.returncode, done.stderr) == (0, ""), done.stderr
     assert {path.name for path in tmp_path.iterdir()} == {
         *put_there,

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import subprocess
 import sys
 from pathlib import Path
 from typing import Any
@@ -18,6 +17,7 @@ from remodel_fenicsx.fem import jit
 from remodel_fenicsx.scene import scene_from_dict
 from remodel_fenicsx.schema.settings import FIELDS_BY_NAME
 from remodel_fenicsx.solver.equilibrium import Equilibrium
+from tests.processes import ran
 from tests.runs import made, rows_of
 
 SELF = MPI.COMM_SELF
@@ -129,9 +129,7 @@ def test_a_run_imports_only_what_it_needs(tmp_path: Path) -> None:
         f"run(scene_from_dict(json.loads({json.dumps(text)!r})), {str(tmp_path / 'run')!r})\n"
         "print(*sorted({module.split('.')[0] for module in sys.modules}))"
     )
-    done = subprocess.run(
-        [sys.executable, "-c", program], capture_output=True, text=True, timeout=300
-    )
+    done = ran([sys.executable, "-c", program])
     assert done.returncode == 0, done.stderr
     imported = set(done.stdout.split())
     assert {"dolfinx", "petsc4py", "ufl"} < imported

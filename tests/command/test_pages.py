@@ -11,7 +11,6 @@ from __future__ import annotations
 import re
 import shlex
 import shutil
-import subprocess
 import tomllib
 from collections.abc import Iterator
 from pathlib import Path
@@ -22,6 +21,7 @@ from docs.making.tutorials import BLOCK, keep, printed_as
 from remodel_fenicsx import cli, read_scene
 from tests.conftest import forked_children
 from tests.forks import forked
+from tests.processes import ran
 
 ROOT = Path(__file__).parents[2]
 TUBE = "tutorial_tube"
@@ -86,7 +86,7 @@ def obey(line: str, capture: pytest.CaptureFixture[str]) -> str:
         done = forked("python", SCRIPT, *words)
     else:
         assert program == "mpirun", line
-        done = subprocess.run([program, *words], capture_output=True, text=True, timeout=200)
+        done = ran([program, *words])
     assert done.returncode == 0, line + "\n" + done.stderr[-1000:]
     return done.stdout + done.stderr
 

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from tests.body.test_tendon import slice_of as slice_of_tendon
-from tests.conftest import Case, Cases
+from tests.conftest import Case
 
 TIGHT = {"absolute_tolerance": 1e-10, "relative_tolerance": 0.0}
 ARTERY = {
@@ -61,10 +61,9 @@ ON_ONE_AND_TWO_RANKS = [
 
 
 @pytest.fixture(scope="module")
-def on_one_and_two_ranks(cases: Cases) -> dict[str, tuple[dict, dict]]:
+def on_one_and_two_ranks(both_ranks: Any) -> dict[str, tuple[dict, dict]]:
     """What each of them saves."""
-    found = (cases(ON_ONE_AND_TWO_RANKS, ranks) for ranks in (1, 2))
-    return dict(zip(SHORT, zip(*found, strict=True), strict=True))
+    return dict(zip(SHORT, both_ranks, strict=True))
 
 
 @pytest.mark.parametrize("name", SCENES)

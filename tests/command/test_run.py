@@ -21,7 +21,7 @@ from remodel_fenicsx.body.shape import COLUMNS
 from remodel_fenicsx.results.recording import read_history
 from tests.conftest import Refused, mpirun, slowly
 from tests.forks import COARSE, forked
-from tests.processes import wait_for_rows
+from tests.processes import ran, wait_for_rows
 
 PROJECT = Path(__file__).parents[2]
 COMMAND = [sys.executable, "-m", "remodel_fenicsx.cli"]
@@ -34,7 +34,7 @@ def run(
     if ranks == 1 and options.keys() <= {"cwd"}:
         return forked("remodel-fenicsx", *arguments, **options)
     command = mpirun(ranks, *COMMAND, *map(str, arguments))
-    return subprocess.run(command, capture_output=True, text=True, timeout=300, **options)  # type: ignore
+    return ran(command, **options)
 
 
 def refusal_of(*words: str | Path, **options: Any) -> str:
@@ -94,7 +94,7 @@ def two_ranks(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Done]:
         json.dumps({name: words for name, (words, _) in commands.items()})
     )
     program = [sys.executable, str(Path(__file__).parents[1] / "commands.py"), str(parent)]
-    done = subprocess.run(mpirun(2, *program), capture_output=True, text=True, timeout=300)
+    done = ran(mpirun(2, *program))
     codes = json.loads((parent / "codes.json").read_text()) | {"nowhere": [done.returncode] * 2}
     assert codes.keys() == commands.keys(), done.stderr
     found = {}
@@ -317,7 +317,7 @@ def test_an_exception_in_a_script_on_two_ranks_ends_both(tmp_path: Path) -> None
     )
     environment = {**os.environ, "PYTHONPATH": str(PROJECT)}
     command = mpirun(2, sys.executable, str(program))
-    done = subprocess.run(command, capture_output=True, text=True, timeout=100, env=environment)
+    done = ran(command, env=environment)
     assert done.returncode != 0
     assert "Not a directory" in done.stderr
 

@@ -15,7 +15,7 @@ from remodel_fenicsx.results.recording import read_history
 from tests.body.test_lumen import tube
 from tests.conftest import slowly
 from tests.forks import forked
-from tests.processes import wait_for_rows
+from tests.processes import ran, wait_for_rows
 
 PROJECT = Path(__file__).parents[2]
 CUBE = ["run", str(PROJECT / "demos" / "cube.toml"), "--set", "time.end=10"]
@@ -126,9 +126,7 @@ sys.meta_path.insert(0, Signal)
 sys.argv = {["remodel-fenicsx", *CUBE, "-o", str(tmp_path / "out")]!r}
 runpy.run_path({str(PROJECT / "bin" / "remodel-fenicsx")!r}, run_name="__main__")
 """
-    done = subprocess.run(
-        [sys.executable, "-c", program], capture_output=True, text=True, timeout=100
-    )
+    done = ran([sys.executable, "-c", program])
     line = f"remodel-fenicsx: stopped by {number.name}\n"
     assert (done.returncode, done.stdout, done.stderr) == (128 + number, "", line)
     assert list(tmp_path.iterdir()) == []
@@ -201,7 +199,7 @@ def test_a_limit_of_files_is_no_fault_of_a_surface(tmp_path: Path) -> None:
     file, words = wall_on(tmp_path)
     for blocks in (20, 200):
         limited = ["bash", "-c", f'ulimit -f {blocks}; exec "$0" "$@"', *words]
-        done = subprocess.run(limited, capture_output=True, text=True, timeout=100)
+        done = ran(limited)
         assert done.returncode == 5, done.stderr
         assert "lumen.vtp" not in done.stderr and "Traceback" not in done.stderr
     assert list(tmp_path.iterdir()) == [file]

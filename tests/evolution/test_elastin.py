@@ -23,7 +23,7 @@ from remodel_fenicsx.results.columns import Measurement
 from remodel_fenicsx.results.export import export
 from remodel_fenicsx.running import run
 from remodel_fenicsx.scene import scene_from_dict
-from tests.conftest import Cases, slowly
+from tests.conftest import slowly
 from tests.mesh_files import TUBE, write_tube
 from tests.reference.elastin import ElasticWall, fresh, outwards, pulled
 from tests.reference.radial import RadialMaterial, secant_stiffness
@@ -384,9 +384,9 @@ def test_what_export_writes_begins_the_same_run(tmp_path: Path) -> None:
 ON_ONE_AND_TWO_RANKS = [{"scene": own_values(TUBE)}]
 
 
-def test_two_ranks_find_the_same(cases: Cases) -> None:
+def test_two_ranks_find_the_same(both_ranks: Any) -> None:
     """Places and columns."""
-    (one,), (two,) = (cases(ON_ONE_AND_TWO_RANKS, ranks) for ranks in (1, 2))
+    ((one, two),) = both_ranks
     for name in ("u", "lumen_volume", *ALONG):
         np.testing.assert_allclose(two[name], one[name], rtol=1e-7, atol=1e-8, err_msg=name)
 

@@ -17,7 +17,7 @@ from remodel_fenicsx.model.laws import TURNOVER_RATES, TurnoverRule
 from remodel_fenicsx.running import run
 from remodel_fenicsx.scene import Scene, scene_from_dict
 from remodel_fenicsx.solver.continuation import StepFailure
-from tests.conftest import slowly
+from tests.conftest import slowly, warnings_of
 from tests.mesh_files import COUNTS, LENGTH, RADII, write_tube
 from tests.reference.radial import RadialMaterial
 from tests.reference.wall import Wall
@@ -149,7 +149,7 @@ def test_walls_rest_where_an_independent_program_says(
         assert row["collagen_share"] == pytest.approx(
             case[0] * row["content"] / row["growth"], abs=0.01
         )
-    assert not [record for record in caplog.records if record.levelname == "WARNING"]
+    assert not warnings_of(caplog)
 
 
 @pytest.mark.parametrize("case", THICK_RESTS, ids=str)
@@ -382,7 +382,7 @@ def test_a_folder_of_an_earlier_version_goes_on_as_it_was(tmp_path: Path) -> Non
 def test_a_vessel_that_grows_pushes_along_its_axis(caplog: pytest.LogCaptureFixture) -> None:
     """A long tube is said to buckle while it thickens."""
     rows_of(wall(0.5, 160.0, None, geometry={"length": 9.0}))
-    (line,) = (record.message for record in caplog.records if record.levelname == "WARNING")
+    (line,) = warnings_of(caplog)
     assert "expected buckling: axial thrust" in line
 
 

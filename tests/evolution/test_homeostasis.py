@@ -13,7 +13,7 @@ from remodel_fenicsx import Recording, Scene, Simulation
 from remodel_fenicsx.evolution.homeostasis import Homeostasis
 from remodel_fenicsx.running import resume, run
 from remodel_fenicsx.scene import scene_from_dict
-from tests.conftest import Case, slowly
+from tests.conftest import Case, slowly, warnings_of
 from tests.runs import SELF, simulated
 from tests.values import ANGLES, isotropic
 
@@ -204,11 +204,7 @@ def test_cells_without_tension_stay_where_the_way_has_left_them(
     caplog.set_level("INFO")
     (_, cells, _), (_, others, simulation) = tube_in_time(3.0, 0.1, HALF_WAY_BACK)
     np.testing.assert_allclose(cells, others, atol=0.03)
-    (said,) = [
-        record.getMessage()
-        for record in caplog.records
-        if "no tension in equilibrium" in record.getMessage()
-    ]
+    (said,) = [line for line in caplog.messages if "no tension in equilibrium" in line]
     values = np.linalg.eigvalsh(simulation.stepper.remodeling.driving_tensor()[1])
     squares = np.sign(values) * values**2
     tension, compression = np.maximum(squares, 0).sum(axis=1), -np.minimum(squares, 0).sum(axis=1)
@@ -235,7 +231,7 @@ def test_the_artery_says_nothing(caplog: pytest.LogCaptureFixture) -> None:
     """And takes about as many solves as it has steps, not one for each unit of time."""
     row = solved(Simulation(artery(), SELF))
     assert row["substeps"] <= 100
-    assert not [record for record in caplog.records if record.levelno >= logging.WARNING]
+    assert not warnings_of(caplog)
 
 
 # ---------------------------------------------------------------- scenes and records

@@ -17,6 +17,7 @@ from remodel_fenicsx.model.laws import LAWS
 from remodel_fenicsx.schema.settings import COUPLINGS
 from remodel_fenicsx.simulation import Simulation
 from tests.runs import made, simulated
+from tests.values import ramp_to
 
 PAIRS = [
     (law, coupling)
@@ -119,9 +120,7 @@ def test_no_step_is_longer_than_the_fastest_region_allows() -> None:
 def test_the_equilibrium_waits_for_the_slowest_region() -> None:
     """At once from two kappas, or from one: the same rest, which depends on no kappa."""
     changes = (("time.end", "equilibrium"), ("output.columns", []), ("cells.initial", "isotropic"))
-    changes += tuple(
-        (f"loads.{load}.ramp", [[0.0, 0.0], [2.0, 1.0]]) for load in ("pressure", "elongation")
-    )
+    changes += tuple((f"loads.{load}.ramp", ramp_to(2.0)) for load in ("pressure", "elongation"))
     both, _, simulation = solved(
         (FIRST, FIRST / 50, FIRST / 50), "tensor", "staggered", changes=_hashable(changes)
     )

@@ -14,6 +14,7 @@ from remodel_fenicsx.scene import preset_scene, scene_from_dict
 from remodel_fenicsx.simulation import Simulation
 from tests import parts
 from tests.parts import tube
+from tests.values import ramp_to
 
 PAPER = "kuhl-holzapfel-2007"
 
@@ -52,7 +53,7 @@ def test_the_relaxed_cube_ends_where_the_papers_ends() -> None:
         "model.kinematics": "point",
         "time.end": 400.0,
         "time.step": 4.0,
-        "loads.force.ramp": [[0.0, 0.0], [40.0, 1.0]],
+        "loads.force.ramp": ramp_to(40.0),
     }
     ends = {}
     for coupling in ("staggered", "relaxed"):

@@ -16,6 +16,7 @@ from remodel_fenicsx.schema.units import FORCE
 from remodel_fenicsx.simulation import Simulation
 from tests.parts import tube
 from tests.runs import goes_on, taylor_orders
+from tests.values import ramp_to, ramped
 
 Array = NDArray[np.float64]
 KAPPA = 0.025
@@ -35,7 +36,7 @@ def short_tube(
     end: float, step: float = 1.0, cells: str = "random", **remodeling: Any
 ) -> Simulation:
     """One layer of elements along the axis, coarse."""
-    ramp = remodeling.pop("ramp", [[0.0, 0.0], [25.0, 1.0]])
+    ramp = remodeling.pop("ramp", ramp_to(25.0))
     settings = scene(
         "tube",
         geometry={"shape": "tube", "length": 1.0},
@@ -64,7 +65,7 @@ def test_the_cubes_angle_is_the_closed_form(coupling: str, passes: int, force: f
     settings = scene(
         "cube",
         remodeling={"coupling": coupling},
-        loads={"force": {"value": force, "ramp": [[0.0, 0.0], [10.0, 1.0]]}},
+        loads=ramped(10.0, force=force),
         time={"end": 40.0},
     )
     simulation = Simulation(settings, MPI.COMM_SELF)
@@ -107,7 +108,7 @@ def test_loads_that_cross_leave_the_cube_homogeneous(
 
 def test_little_is_made_of_what_is_off_the_axes_under_compression() -> None:
     """A off by up to 1e-3: the switch lets the lateral tension, which is noise, turn nothing."""
-    ramp = [[0.0, 0.0], [10.0, 1.0]]
+    ramp = ramp_to(10.0)
     settings = scene("cube", loads={"force": {"value": -10.0, "ramp": ramp}}, time={"end": 40.0})
     simulation = Simulation(settings, MPI.COMM_SELF)
     noise = np.random.default_rng(1).uniform(
@@ -247,7 +248,7 @@ def test_the_target_of_a_first_step_is_not_extrapolated() -> None:
 def test_a_step_that_is_solved_twice_is_one_step() -> None:
     """The little that its second solve moves is no measure for the next step, which would be looked into."""
     first, second = (
-        step.work.newton_iterations for step in pulled_cube([[0.0, 0.0], [10.0, 1.0]], 2.0).steps()
+        step.work.newton_iterations for step in pulled_cube(ramp_to(10.0), 2.0).steps()
     )
     assert second < first
 

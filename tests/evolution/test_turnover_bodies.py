@@ -15,7 +15,6 @@ from remodel_fenicsx.model.drivers import DRIVERS
 from remodel_fenicsx.model.energy import Tissue
 from remodel_fenicsx.running import run
 from remodel_fenicsx.scene import scene_from_dict
-from tests.conftest import Cases
 from tests.runs import simulated
 from tests.values import TENSION, ramped, isotropic
 
@@ -182,9 +181,9 @@ WHOLE = isotropic(
 ON_ONE_AND_TWO_RANKS = [{"scene": WHOLE, "divisions": [8, 1, 1]}]
 
 
-def test_one_and_two_ranks_agree(cases: Cases) -> None:
+def test_one_and_two_ranks_agree(both_ranks: Any) -> None:
     """Random cells in three dimensions, with two load cases."""
-    (one,), (two,) = (cases(ON_ONE_AND_TWO_RANKS, ranks) for ranks in (1, 2))
+    ((one, two),) = both_ranks
     np.testing.assert_allclose(two["l"], one["l"], atol=1e-9)
     for name in (*TURNED, "growth", "inner_radius@2"):
         np.testing.assert_allclose(two[name], one[name], rtol=1e-9)

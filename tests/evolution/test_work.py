@@ -15,7 +15,7 @@ from remodel_fenicsx.scene.scene import Scene, scene_from_dict
 from remodel_fenicsx.solver.continuation import MIN_HALVINGS_FOR_JUMP
 from remodel_fenicsx.solver.newton import GuardedNewton, Solution, SolveFailure
 from tests.runs import made
-from tests.values import isotropic
+from tests.values import isotropic, ramp_to
 
 Attempt = Solution | SolveFailure
 PRESETS = {"staggered": "kuhl-holzapfel-2007", "extrapolated": "consistent"}
@@ -98,7 +98,7 @@ def test_failed_solves_and_parts_count(coupling: str, attempts: list[Attempt]) -
     """A load far too large for one piece."""
     changes = {
         "loads.pressure.value": 30.0,
-        "loads.pressure.ramp": [[0.0, 0.0], [2.0, 1.0]],
+        "loads.pressure.ramp": ramp_to(2.0),
         "time.step": 2.0,
     }
     scene = artery(coupling, **changes, **{"solver.maximum_iterations": 4})

@@ -22,7 +22,7 @@ from tests.locking_bodies import EXACT_TUBE, bar_scene, registered, thick_tube
 from tests.parts import cube, smooth, tube
 from tests.reference.radial import RadialMaterial, solve_radial
 from tests.runs import SELF, last_row, simulated
-from tests.values import ANGLES, ramped, isotropic
+from tests.values import ANGLES, isotropic, ramp_to, ramped
 
 SELECTIVE = "selective-integration"
 STIFF = Material(lame_mu=3.103, lame_lambda=3.103e4)
@@ -148,15 +148,13 @@ def test_a_tube_that_locks_is_told(caplog: Any) -> None:
     locking = thick_tube(1e3, "displacement")
     with caplog.at_level(logging.WARNING), simulated(locking, meshed(locking, 16, 8)) as (_, rows):
         lacking = 1 - (rows[-1]["inner_radius"] - 1) / EXACT_TUBE
-    (record,) = caplog.records
-    assert record.getMessage().startswith(
-        "time 1: volumetric locking: displacements too small by about "
-    )
-    assert record.getMessage().endswith(
+    (line,) = caplog.messages
+    assert line.startswith("time 1: volumetric locking: displacements too small by about ")
+    assert line.endswith(
         " % (lambda/mu up to 1000); set mesh.element = 'hexahedron' and mesh.formulation = "
         "'selective-integration' (docs/solver.md, Volumetric locking)"
     )
-    said = float(record.getMessage().split("about ")[1].split(" %")[0]) / 100
+    said = float(line.split("about ")[1].split(" %")[0]) / 100
     assert lacking == pytest.approx(said, abs=0.15) and lacking > 0.7
 
 
@@ -186,7 +184,7 @@ def test_a_run_knows_what_its_elements_lack(
         )
     lacking = 1 - (rows[-1]["inner_radius"] - 1) / (exact - 1)
     assert missing == pytest.approx(lacking, rel=0.25, abs=0.005)
-    told = [record.getMessage() for record in caplog.records]
+    told = caplog.messages
     assert len(told) == (lacking > 0.05), told
     cause = "volumetric locking" if formulation == "displacement" else "elements too large"
     assert all(cause in line for line in told)
@@ -204,7 +202,7 @@ def test_elements_that_lock_in_an_elongated_tube_are_told(
     """
     scene = thick_tube(250.0, "displacement", pressure, chain_density=2e21).with_values({
         "model.kinematics": kinematics, "cells.initial": "aligned", "cells.aligned_axis": 1,
-        "cells.axes": "cylindrical", "loads.elongation": {"value": 0.1, "ramp": [[0.0, 0.0], [4.0, 1.0]]},
+        "cells.axes": "cylindrical", "loads.elongation": {"value": 0.1, "ramp": ramp_to(4.0)},
     })  # fmt: skip
     with caplog.at_level(logging.WARNING), simulated(scene) as (simulation, rows):
         missing = sum(LockingWarning(simulation.stepper, True).missing_deformation())
@@ -215,7 +213,7 @@ def test_elements_that_lock_in_an_elongated_tube_are_told(
     )
     assert np.abs(found - exact).max() > 0.05 * np.abs(exact).max()
     assert missing > 0.05
-    assert ["volumetric locking" in record.getMessage() for record in caplog.records] == [True]
+    assert ["volumetric locking" in line for line in caplog.messages] == [True]
 
 
 # ---------------------------------------------------------------- cells that turn in a stiff bulk
@@ -271,11 +269,7 @@ def test_pressure_that_is_noise_is_told(ratio: float, degree: int, told: bool, c
         found = at_the_end(scene)
     smooth_pressure = at_the_end(scene.with_values({"mesh.formulation": SELECTIVE}))
     assert (np.abs(found - smooth_pressure)[2:].max() > 1.0) == told
-    said = [
-        record.getMessage()
-        for record in caplog.records
-        if "pressure oscillations" in record.getMessage()
-    ]
+    said = [line for line in caplog.messages if "pressure oscillations" in line]
     assert len(said) == told and all(
         "mesh.formulation = 'selective-integration'" in line for line in said
     )
@@ -306,7 +300,7 @@ def test_linear_tetrahedra_in_a_stiff_bulk_are_told(caplog: Any) -> None:
     scene = remodeling_tube(300.0, **values, **{"time.end": 5.0})
     with caplog.at_level(logging.WARNING), simulated(scene, meshed(scene, 8, 4)):
         pass
-    assert any("pressure oscillations" in record.getMessage() for record in caplog.records)
+    assert any("pressure oscillations" in line for line in caplog.messages)
 
 
 @pytest.mark.parametrize(("changes", "remedy"), [
@@ -319,12 +313,8 @@ def test_what_is_told_can_be_done_and_is_told_once(
     """Of accepted steps alone: a step that is taken back has said nothing."""
     scene = remodeling_tube(1e3, **{"time.end": 5.0}, **changes)
     with caplog.at_level(logging.WARNING), simulated(scene) as (_, rows):
-        times = [float(record.getMessage()[5:].split(":")[0]) for record in caplog.records]
-    told = [
-        record.getMessage()
-        for record in caplog.records
-        if "pressure oscillations" in record.getMessage()
-    ]
+        times = [float(line[5:].split(":")[0]) for line in caplog.messages]
+    told = [line for line in caplog.messages if "pressure oscillations" in line]
     assert len(told) == 1 and remedy in told[0]
     assert all(np.isclose(time, [row["time"] for row in rows]).any() for time in times)
 
@@ -373,9 +363,7 @@ def test_what_cells_do_is_no_lack_of_elements(caplog: Any) -> None:
     ):
         watcher = LockingWarning(simulation.stepper, True)
         assert sum(watcher.energies()[1:]) > 0.2 * watcher.work()[0]
-    assert not [
-        record for record in caplog.records if "displacements are off by" in record.getMessage()
-    ]
+    assert "displacements are off by" not in caplog.text
 
 
 RANDOM_CUBE = {

@@ -17,7 +17,7 @@ import pytest
 
 from tests.conftest import mpirun, slowly
 from tests.forks import forked
-from tests.processes import all_end, wait_for_compiler
+from tests.processes import all_end, ran, wait_for_compiler
 
 PROGRAM = """
 import logging, sys, ufl, dolfinx
@@ -41,9 +41,7 @@ def compile_and_use(
     if ranks == 1:
         return forked("python", PROGRAM, variables=environment | variables)
     command = mpirun(ranks, *command)
-    return subprocess.run(
-        command, capture_output=True, text=True, timeout=120, env=environment | variables
-    )
+    return ran(command, env=environment | variables)
 
 
 def program(cache: Path, text: str = PROGRAM) -> tuple[list[str], dict[str, str]]:

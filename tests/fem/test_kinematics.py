@@ -18,10 +18,11 @@ from remodel_fenicsx.fem import jit
 from remodel_fenicsx.model.cells import structure_tensor
 from remodel_fenicsx.results.columns import Measurement
 from remodel_fenicsx.scene import scene_from_dict
-from tests.conftest import Cases, Refused, slowly
+from tests.conftest import Refused, slowly
 from tests.reference.radial import solve_radial
 from tests.runs import columns_of, made
 from tests.tables import rows as table, values as values_of
+from tests.values import ramped
 
 SELF = MPI.COMM_SELF
 ISOTROPIC = {"initial": "isotropic"}
@@ -211,7 +212,7 @@ def test_a_load_is_for_the_reductions_that_have_it(monkeypatch: pytest.MonkeyPat
 
     lift = LoadKind(lambda shape, loading, name: None, "of a quarter", reductions=("sector",))
     monkeypatch.setitem(Tube.loads, "lift", lift)
-    lifted = scene("tube", AUTO, 2.0, loads={"lift": {"value": 1.0, "ramp": [[0, 0], [2, 1]]}})
+    lifted = scene("tube", AUTO, 2.0, loads=ramped(2, lift=1.0))
     for name in ("radial", "axisymmetric"):
         with pytest.raises(SceneError, match=f"'{name}': loads.lift "):
             lifted.with_values({"model.kinematics": name})
@@ -306,10 +307,9 @@ ON_ONE_AND_TWO_RANKS = [
 
 
 @pytest.fixture(scope="module")
-def on_one_and_two_ranks(cases: Cases) -> dict[str, tuple[dict[str, Any], dict[str, Any]]]:
+def on_one_and_two_ranks(both_ranks: Any) -> dict[str, tuple[dict[str, Any], dict[str, Any]]]:
     """What each of them saves."""
-    found = (cases(ON_ONE_AND_TWO_RANKS, ranks) for ranks in (1, 2))
-    return dict(zip(TWICE, zip(*found, strict=True), strict=True))
+    return dict(zip(TWICE, both_ranks, strict=True))
 
 
 @pytest.mark.parametrize("name", TWICE)
@@ -406,7 +406,7 @@ def test_auto_is_full_where_a_load_presses(force: float, unstable: str, name: st
     """The cube under -30 leaves its shape by a mode that a point does not have."""
     scene = scene_from_dict({
         "geometry": {"shape": "cube"}, "cells": {"initial": "isotropic"}, "time": {"end": 3.0},
-        "loads": {"force": {"value": force, "ramp": [[0.0, 0.0], [3.0, 1.0]]}},
+        "loads": ramped(3.0, force=force),
     })  # fmt: skip
     assert choice(scene).name == name
     assert ("buckle" in " ".join(describe_choice(scene))) == (name == "full")

@@ -7,6 +7,7 @@ import pytest
 
 from remodel_fenicsx import Scene
 from tests.runs import simulated
+from tests.values import ramped
 
 
 def neo_hookean_stretch(stress: float, lame_lambda: float, lame_mu: float) -> float:
@@ -34,7 +35,7 @@ def test_without_chains_nothing_locks(law: str) -> None:
     scene = Scene(
         geometry={"shape": "cube"},
         material={"chain_density": 0.0},
-        loads={"force": {"value": 30.0, "ramp": [[0.0, 0.0], [10.0, 1.0]]}},
+        loads=ramped(10.0, force=30.0),
         remodeling={"law": law},
         time={"end": 11.0},
     )

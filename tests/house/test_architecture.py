@@ -6,13 +6,14 @@ import ast
 import functools
 import pkgutil
 import re
-import subprocess
 import sys
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
 import pytest
+
+from tests.processes import ran
 
 
 ROOT = Path(__file__).parents[2]
@@ -196,9 +197,7 @@ def test_importing_costs_no_more_than_it_must(module: str, never: str) -> None:
     program = (
         f"import sys, {module}; print(*(name for name in {never.split()} if name in sys.modules))"
     )
-    done = subprocess.run(
-        [sys.executable, "-c", program], cwd=ROOT, capture_output=True, text=True, timeout=120
-    )
+    done = ran([sys.executable, "-c", program], cwd=ROOT)
     assert (done.returncode, done.stdout.strip()) == (0, ""), done.stderr
 
 
@@ -209,9 +208,7 @@ def test_a_scene_imports_no_other_shape() -> None:
     ]
     scene = f"{PACKAGE}.scene.preset_scene('consistent', 'tube')"
     program = f"import sys, {PACKAGE}.scene; {scene}; print(*(name for name in {others} if name in sys.modules))"
-    done = subprocess.run(
-        [sys.executable, "-c", program], cwd=ROOT, capture_output=True, text=True, timeout=120
-    )
+    done = ran([sys.executable, "-c", program], cwd=ROOT)
     assert (done.returncode, done.stdout.strip()) == (0, ""), done.stderr
 
 

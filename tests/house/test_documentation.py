@@ -6,7 +6,6 @@ import json
 import re
 import runpy
 import shlex
-import subprocess
 import sys
 from pathlib import Path
 
@@ -16,6 +15,7 @@ import remodel_fenicsx
 from remodel_fenicsx import cli
 from tests.conftest import mpirun
 from tests.forks import COARSE, forked
+from tests.processes import ran
 
 ROOT = Path(__file__).parents[2]
 
@@ -27,9 +27,7 @@ def page(name: str | Path) -> str:
 
 def test_pages_that_need_no_run_are_those_that_the_code_makes() -> None:
     """Keys, schema, public interface, columns; what is added, renamed or dropped shows in their own history."""
-    made = subprocess.run(
-        [sys.executable, ROOT / "docs/make", "--check"], capture_output=True, text=True
-    )
+    made = ran([sys.executable, ROOT / "docs/make", "--check"])
     assert (
         made.returncode == 0
     ), f"if that is meant (CHANGELOG.md says so, where it is public):\n{made.stdout}{made.stderr}"
@@ -48,9 +46,7 @@ def test_the_python_of_the_readme_runs_as_it_stands(tmp_path: Path) -> None:
     (tmp_path / "mine.py").write_text(COARSE + short)
     outputs = [forked("python", COARSE + short, cwd=tmp_path)]
     command = mpirun(2, sys.executable, "mine.py")
-    outputs.append(
-        subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, timeout=200)
-    )
+    outputs.append(ran(command, cwd=tmp_path))
     for done, folder in zip(outputs, ("tube", "tube-2"), strict=True):
         assert done.returncode == 0, done.stderr[-2000:]
         *steps, radii = done.stdout.strip().split("\n")
@@ -156,7 +152,7 @@ def test_pages_are_short() -> None:
 
 
 def test_no_file_has_marks_of_a_merge_conflict() -> None:
-    assert subprocess.run(["git", "grep", "-IlE", "^(<{7}|>{7}) "], cwd=ROOT).returncode == 1
+    assert ran(["git", "grep", "-IlE", "^(<{7}|>{7}) "], cwd=ROOT).returncode == 1
 
 
 LINK = re.compile(r"\]\((?!\w+:|#)([^)#\s]+)[^)]*\)")

@@ -4,11 +4,12 @@ from __future__ import annotations
 
 import re
 import shutil
-import subprocess
 import sys
 from pathlib import Path
 
 import pytest
+
+from tests.processes import ran
 
 ROOT = Path(__file__).parents[2]
 PACKAGE = ROOT / "remodel_fenicsx"
@@ -71,7 +72,7 @@ def test_a_feature_leaves_with_its_files(files: tuple[str, ...], tmp_path: Path)
     for file in files:
         (copy / file).unlink()
     command = [sys.executable, "-c", THREE_BODIES + UNKNOWN]
-    done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, check=False)
+    done = ran(command, cwd=tmp_path)
     assert done.returncode == 0, done.stderr
     modules, table, column = done.stdout.splitlines()
     assert "remodel_fenicsx.evolution.stepper" in modules.split()

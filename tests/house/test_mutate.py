@@ -5,7 +5,6 @@ from __future__ import annotations
 import ast
 import os
 import runpy
-import subprocess
 import sys
 from pathlib import Path
 from types import SimpleNamespace
@@ -13,6 +12,7 @@ from typing import Any
 
 import pytest
 
+from tests.processes import ran
 from tests.tables import rows
 
 MUTATE = Path(__file__).parents[1] / "mutate"
@@ -57,7 +57,7 @@ def mutate(project: Path, *arguments: str) -> tuple[int, str]:
     ]
     # the project's tests are plain: pytest's plugins, which take longer than they do, stay away
     environment = {**os.environ, "PYTEST_DISABLE_PLUGIN_AUTOLOAD": "1"}
-    done = subprocess.run(command, capture_output=True, text=True, timeout=120, env=environment)
+    done = ran(command, env=environment)
     assert "Traceback" not in done.stderr, done.stderr
     return done.returncode, done.stdout
 
@@ -99,8 +99,6 @@ def test_what_is_not_there_is_said_and_nothing_runs(project: Path, entry: str) -
 
 def test_the_table_fits_the_project() -> None:
     """Who takes away what a fault changes takes its entry away too."""
-    done = subprocess.run(
-        [sys.executable, str(MUTATE), "--list"], capture_output=True, text=True, timeout=200
-    )
+    done = ran([sys.executable, str(MUTATE), "--list"])
     assert done.returncode == 0, done.stdout + done.stderr
     assert len(done.stdout.splitlines()) >= 250

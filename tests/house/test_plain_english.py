@@ -5,10 +5,11 @@ from __future__ import annotations
 import os
 import re
 import shutil
-import subprocess
 from pathlib import Path
 
 import pytest
+
+from tests.processes import ran
 
 ROOT = Path(__file__).parents[2]
 PAGES = {
@@ -66,15 +67,13 @@ def test_words_are_spelled_right() -> None:
         *map(str, PAGES.values()),
         *(str(ROOT / room) for room in ("remodel_fenicsx", "demos", "docs", "benchmarks")),
     ]
-    done = subprocess.run(
+    done = ran(
         [
             "codespell",
             "--skip",
             "*.js,*.json,*.pyc,*.svg,*.csv,example_report.html,_site",
             *ignored,
             *files,
-        ],
-        capture_output=True,
-        text=True,
+        ]
     )
     assert done.returncode == 0, done.stdout[-3000:]

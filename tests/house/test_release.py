@@ -5,7 +5,6 @@ from __future__ import annotations
 import os
 import re
 import shutil
-import subprocess
 import sys
 import tarfile
 import tomllib
@@ -15,6 +14,7 @@ from pathlib import Path
 import pytest
 
 from remodel_fenicsx import __version__
+from tests.processes import ran
 
 ROOT = Path(__file__).parents[2]
 ASSETS = ROOT / "remodel_fenicsx" / "report" / "assets"
@@ -67,9 +67,7 @@ def test_the_package_is_built_and_installed_beside_a_dolfinx(tmp_path: Path) -> 
     alone = {name: value for name, value in os.environ.items() if name != "PYTHONPATH"}
 
     def call(*words: str | Path) -> str:
-        done = subprocess.run(
-            words, cwd=tmp_path, capture_output=True, text=True, timeout=200, env=alone
-        )
+        done = ran(words, cwd=tmp_path, env=alone)
         assert done.returncode == 0, done.stdout[-1000:] + done.stderr[-1000:]
         return done.stdout
 

@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 
 from tests.conftest import mpirun, slowly
-from tests.processes import has_ended
+from tests.processes import has_ended, ran
 
 PROJECT = Path(__file__).resolve().parents[2]
 RANK = "import os, sys, time; from mpi4py import MPI; open(f'{sys.argv[1]}/{os.getpid()}', 'w'); MPI.COMM_WORLD.recv()"
@@ -36,9 +36,7 @@ pytestmark = pytest.mark.timeout(1, func_only=True)
 def session(folder: Path, *arguments: str, **variables: str) -> subprocess.CompletedProcess[str]:
     """Run pytest with the plugin on a folder's tests."""
     command = [sys.executable, "-m", "pytest", *words_of(folder, *arguments)]
-    return subprocess.run(
-        command, cwd=folder, env=environment_of(**variables), capture_output=True, text=True
-    )
+    return ran(command, cwd=folder, env=environment_of(**variables))
 
 
 def words_of(folder: Path, *arguments: str) -> list[str]:

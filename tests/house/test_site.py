@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import os
 import re
-import subprocess
 import sys
 from collections.abc import Iterator
 from pathlib import Path
@@ -13,6 +12,7 @@ from urllib.parse import quote
 import pytest
 
 from tests.browser import Browser, browser_path
+from tests.processes import ran
 
 ROOT = Path(__file__).parents[2]
 pytest.importorskip("sphinx", reason="no Sphinx: pip install '.[docs]'")
@@ -22,12 +22,7 @@ pytest.importorskip("sphinx", reason="no Sphinx: pip install '.[docs]'")
 def site(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Its folder."""
     folder = tmp_path_factory.mktemp("site")
-    done = subprocess.run(
-        [sys.executable, ROOT / "docs" / "build", "-o", folder],
-        capture_output=True,
-        text=True,
-        timeout=300,
-    )
+    done = ran([sys.executable, ROOT / "docs" / "build", "-o", folder])
     assert done.returncode == 0, done.stdout + done.stderr
     return folder
 

@@ -7,7 +7,6 @@ import os
 import re
 import shlex
 import shutil
-import subprocess
 import sys
 from pathlib import Path
 from typing import Any
@@ -23,6 +22,7 @@ from remodel_fenicsx.model.cells import structure_tensor
 from remodel_fenicsx.scene import preset_scene
 from remodel_fenicsx.system.environment import KERNELS, versions
 from tests.conftest import Refused
+from tests.processes import ran
 from tests.runs import simulated
 
 ROOT = Path(__file__).parents[2]
@@ -35,9 +35,7 @@ def test_there_is_no_warning(name: str, tmp_path: Path) -> None:
     """All that the compiler sees when it optimises, which is all with -O2."""
     asked = "-O2 -Wall -Wextra -Werror -c -x c - -o".split()
     command = [*CC, *jit.LIBRARY_FLAGS, *asked, tmp_path / "object"]
-    done = subprocess.run(
-        command, input=kernels.source(name, NUMBERS[name]), capture_output=True, text=True
-    )
+    done = ran(command, input=kernels.source(name, NUMBERS[name]))
     assert (done.returncode, done.stderr) == (0, "")
     assert not {"-w", "-Wno-all"} & set(jit.LIBRARY_FLAGS)
 
@@ -56,17 +54,13 @@ sys.exit(pytest.main(["-q", "-s", "-p", "no:cacheprovider", "-x", *files]))
 def test_memory_and_arithmetic_under_the_sanitizers() -> None:
     """What is held against numpy once more, with C that ends the process where it leaves an array, or the standard."""
     asked = [[*CC, f"-print-file-name=lib{name}.so"] for name in ("asan", "ubsan")]
-    found = [
-        subprocess.run(command, capture_output=True, text=True).stdout.strip() for command in asked
-    ]
+    found = [ran(command).stdout.strip() for command in asked]
     if not all(map(os.path.isabs, found)):
         pytest.skip(f"{CC[0]} has no address and undefined-behaviour sanitizers")
     # what Python and its libraries keep to their end is no leak of ours
     own = {"LD_PRELOAD": " ".join(found), "ASAN_OPTIONS": "detect_leaks=0", "PYTHONPATH": str(ROOT)}
     command = [sys.executable, "-c", SANITIZED]
-    done = subprocess.run(
-        command, cwd=ROOT, env=os.environ | own, capture_output=True, text=True, timeout=300
-    )
+    done = ran(command, cwd=ROOT, env=os.environ | own)
     assert done.returncode == 0, (done.stdout + done.stderr)[-4000:]
     assert re.search(r"\d\d passed", done.stdout)
 

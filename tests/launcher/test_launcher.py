@@ -17,6 +17,8 @@ from pathlib import Path
 
 import pytest
 
+from tests.processes import ran
+
 
 pytestmark = pytest.mark.launcher
 PROJECT = Path(__file__).resolve().parents[2]
@@ -547,12 +549,7 @@ def test_inside_an_environment_it_is_native():
     environment = {
         name: value for name, value in os.environ.items() if not name.startswith("WITH_FENICSX")
     }
-    result = subprocess.run(
-        [PROJECT / "with-fenicsx", "-v", "sh", "-c", "echo inside"],
-        env=environment,
-        capture_output=True,
-        text=True,
-    )
+    result = ran([PROJECT / "with-fenicsx", "-v", "sh", "-c", "echo inside"], env=environment)
     assert (result.returncode, result.stdout) == (0, "inside\n")
     assert (
         result.stderr

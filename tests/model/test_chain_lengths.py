@@ -19,6 +19,7 @@ from remodel_fenicsx.model.energy import REPULSIONS, Tissue
 from remodel_fenicsx.scene import preset_scene
 from remodel_fenicsx.scene.scene import Scene
 from remodel_fenicsx.simulation import Simulation
+from tests.conftest import warnings_of
 from tests.tables import rows as table, values as values_of
 from tests.values import deformations
 from tests.watch.test_over_correction import Tilt
@@ -69,7 +70,7 @@ def run(name: str, unit: float, caplog: pytest.LogCaptureFixture) -> Run:
     with caplog.at_level(logging.INFO, "remodel_fenicsx"):
         simulation = Simulation(scene_in(unit, *CASES[name]), MPI.COMM_SELF)
         steps = list(simulation.steps())
-    said = [r.getMessage() for r in caplog.records if "compil" not in r.getMessage()]
+    said = [line for line in caplog.messages if "compil" not in line]
     rows = {
         column: np.array([step.row[column] for step in steps], dtype=float)
         for column in steps[0].row
@@ -121,7 +122,7 @@ def test_a_swing_is_warned_of_alike(caplog: pytest.LogCaptureFixture) -> None:
             scene_in(unit, PAPER, "cube", {"loads.force.value": 0.01, "time.end": 35.0})
         )
         list(simulation.steps([Tilt(simulation, 20.0, 1e-8)]))
-        said.append([r.getMessage() for r in caplog.records if r.levelno >= logging.WARNING])
+        said.append(warnings_of(caplog))
     assert said[1] == said[0] and "overshoots" in said[0][0]
 
 

@@ -11,6 +11,7 @@ from remodel_fenicsx.model.drivers import DRIVERS, FRAMES
 from remodel_fenicsx.model.laws import LAWS, Array, Drive, remaining_angle
 from tests import parts
 from tests.runs import made
+from tests.values import ramped
 
 TAU = 3.0
 FIBRE = np.array([0.9, 0.4, 0.1])  # dimensions of a cell
@@ -232,7 +233,7 @@ def test_a_cube_with_fibres_across_its_load(
         geometry={"shape": "cube"},
         material={"chain_density": 1e12},
         cells={"initial": "aligned", "aligned_axis": 1},
-        loads={"force": {"value": 0.5, "ramp": [[0.0, 0.0], [2.0, 1.0]]}},
+        loads=ramped(2.0, force=0.5),
         remodeling={
             "law": "rotation",
             "rotation_time": tau,

@@ -26,6 +26,7 @@ from remodel_fenicsx.scene.scene import preset_scene
 from tests.conftest import Refused
 from tests.forks import forked
 from tests.report.conftest import DEMOS, Recorded
+from tests.values import ramp_to
 
 ASSETS = page.ASSETS
 HOSTILE = "</script><img src=x onerror=alert(1)>"
@@ -84,7 +85,7 @@ def test_stresses_through_the_wall_are_those_of_the_columns(
     names = [f"{name}_stress_middle" for name in ("hoop", "axial", "radial")]
     changes = {
         "cells.initial": "isotropic", "model.kinematics": kinematics, "time.end": 3.0, "loads.pressure.value": 2.0,
-        "loads.pressure.ramp": [[0.0, 0.0], [3.0, 1.0]], "output.columns": [*names, "inner_radius", "outer_radius"],
+        "loads.pressure.ramp": ramp_to(3.0), "output.columns": [*names, "inner_radius", "outer_radius"],
     }  # fmt: skip
     folder = run_scene(
         preset_scene("kuhl-holzapfel-2007", "tube").with_values(changes), tmp_path / "run"

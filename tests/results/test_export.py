@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import csv
 import re
 import xml.etree.ElementTree as ElementTree
 from collections.abc import Iterator
@@ -20,9 +19,10 @@ from remodel_fenicsx.results.vtkhdf import TransientGrid, vtk_cells
 from tests.conftest import Refused
 from tests.mesh_files import NAMES, write_tube
 from tests.results.test_stress_on_the_body import SCENES
-from tests.tables import rows
+from tests.tables import of_csv, rows
+from tests.values import ramp_to
 
-RAMP = [[0.0, 0.0], [3.0, 1.0]]
+RAMP = ramp_to(3.0)
 TUBE: dict[str, Any] = {
     "geometry": {"shape": "tube", "inner_radius": 1.0, "outer_radius": 3.0, "length": 1.0},
     "cells": {"initial": "random"},
@@ -319,7 +319,7 @@ def test_vtu_and_csv_hold_the_same(start: Path) -> None:
     )
     for name in CELLS:
         np.testing.assert_array_equal(mesh.cell_data[name][0], recording.fields(0.0)[name])
-    rows = list(csv.DictReader(exported(start, "csv").read_text().splitlines()))
+    rows = of_csv(exported(start, "csv"))
     assert [int(row["element"]) for row in rows] == [*range(1, len(tensors) + 1)]
     found = [[float(row[f"structure_tensor_{i}{j}"]) for i in "xyz" for j in "xyz"] for row in rows]
     np.testing.assert_allclose(np.reshape(found, (-1, 3, 3)), tensors, rtol=0, atol=1e-15)

@@ -5,7 +5,6 @@ from __future__ import annotations
 import os
 import re
 import shutil
-import subprocess
 import sys
 from pathlib import Path
 
@@ -17,6 +16,7 @@ from remodel_fenicsx import Recording
 from remodel_fenicsx.results.recording import RecordingError
 from remodel_fenicsx.results.vtkhdf import TransientGrid
 from remodel_fenicsx.scene.scene import Scene, scene_from_dict
+from tests.processes import ran
 
 POINTS = np.array(
     [[x, y, z] for z in (0, 1, 2) for x, y in ((0, 0), (1, 0), (1, 1), (0, 1))], dtype=float
@@ -174,6 +174,6 @@ def test_the_page_shows_what_reads_results_without_dolfinx(
     shutil.copytree(folder, place / "results" / "artery")
     environment = os.environ | {"PYTHONPATH": str(Path(run_folder.__file__).parents[2])}
     command = [sys.executable, "-c", WITHOUT_DOLFINX + code]
-    done = subprocess.run(command, cwd=place, env=environment, capture_output=True, text=True)
+    done = ran(command, cwd=place, env=environment)
     assert done.returncode == 0, done.stderr
     assert done.stdout == f"{scene().time.end} 2.0 (2, 8, 3) 2.0\n"

@@ -12,11 +12,12 @@ from remodel_fenicsx import Recording, Scene, SceneError, run
 from remodel_fenicsx.results.whole_body import revolve
 from remodel_fenicsx.running import resume
 from remodel_fenicsx.studies import sweep as study
-from tests.conftest import Cases, forked_children
+from tests.conftest import forked_children
 from tests.results.test_resume import assert_same
 from tests.runs import made
+from tests.values import ramp_to
 
-RAMP = [[0.0, 0.0], [3.0, 1.0]]
+RAMP = ramp_to(3.0)
 VALUES: dict[str, Any] = {
     "geometry": {"shape": "tube", "inner_radius": 1.0, "outer_radius": 3.0, "length": 1.0},
     "regions": {
@@ -111,8 +112,8 @@ def test_it_goes_on_to_the_last_bit(recorded: Path, tmp_path: Path) -> None:
         resume(half, ["regions.media.remodeling.kappa=0.2"])
 
 
-def test_one_and_two_ranks_agree(cases: Cases) -> None:
-    (one,), (two,) = (cases(ON_ONE_AND_TWO_RANKS, ranks) for ranks in (1, 2))
+def test_one_and_two_ranks_agree(both_ranks: Any) -> None:
+    ((one, two),) = both_ranks
     np.testing.assert_array_equal(one["l0"], two["l0"])
     assert np.ptp(one["l0"], axis=(0, 1)).min() > 0.5, "isotropic and random cells"
     for name in (*COLUMNS, "inner_radius", "outer_radius"):

@@ -37,6 +37,7 @@ from remodel_fenicsx.state import State
 from remodel_fenicsx.system.interrupts import Paused
 from tests.conftest import mpirun
 from tests.parts import pulled_cube
+from tests.processes import ran
 from tests.runs import made
 from tests.tables import rows as table
 
@@ -333,7 +334,7 @@ def two_ranks(first_half: Path, tmp_path_factory: pytest.TempPathFactory) -> tup
     line = mpirun(
         2, sys.executable, str(Path(__file__).parents[1] / "on_two_ranks.py"), str(folder)
     )
-    done = subprocess.run(line, capture_output=True, text=True, timeout=300)
+    done = ran(line)
     assert done.returncode != 0 and (folder / "lost").exists(), done.stderr
     return folder, done.stderr
 

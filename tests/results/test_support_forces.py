@@ -13,10 +13,9 @@ from remodel_fenicsx.body.tube import whole_tube
 from remodel_fenicsx.results.recording import unit_of
 from tests.mesh_files import COUNTS, LENGTH, RADII, write_tube
 from tests.runs import SELF, last_row, rows_of
-from tests.values import ramped
+from tests.values import TURN, ramp_to, ramped
 
 ENDS = ["support_force_inlet", "support_force_outlet"]
-TURN = np.array([[0.36, 0.48, -0.8], [-0.8, 0.6, 0.0], [0.48, 0.64, 0.6]])
 LAW = {"law": "tensor", "coupling": "staggered"}
 
 
@@ -59,7 +58,7 @@ def test_ends_pull_with_the_force_of_the_wall(kind: str, ends: str, tube: Path) 
 
 def test_a_pressure_on_an_end_is_what_its_support_bears(tube: Path) -> None:
     """Of springs: the pressure times the area of the end, by Newton's third law, whatever the tissue does."""
-    loads = {"push": {"kind": "pressure", "face": "outlet", "value": 0.2, "ramp": [[0, 0], [1, 1]]}}
+    loads = {"push": {"kind": "pressure", "face": "outlet", "value": 0.2, "ramp": ramp_to(1)}}
     springs = {"outlet": {"kind": "free"}}
     short: dict[str, Any] = {"loads": loads, "time": {"end": 1.0}}
     row = last_row(scene(tube, ENDS[:1], supports=springs, **short))

@@ -14,6 +14,7 @@ import pytest
 from remodel_fenicsx import cli, preset_scene, run as run_scene
 from remodel_fenicsx.system.files import write_new
 from tests.conftest import Refused
+from tests.processes import ran
 
 # a command that is killed at its N-th write, rename or link that has to do with a file of this name
 KILLED = """
@@ -56,7 +57,7 @@ def test_revolve_that_was_killed_does_not_block_itself(quarter: Path) -> None:
         "revolve",
         str(quarter),
     ]
-    done = subprocess.run(command, capture_output=True, text=True)
+    done = ran(command)
     assert done.returncode == -signal.SIGKILL, done.stderr
     assert not any((quarter / name).exists() for name in names)
     assert cli.main(["revolve", str(quarter)]) == 0

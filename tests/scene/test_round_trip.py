@@ -16,8 +16,9 @@ from remodel_fenicsx.body import SHAPES
 from remodel_fenicsx.scene.scene import Scene, scene_from_dict
 from remodel_fenicsx.schema.tables import choices, sections
 from tests.mesh_files import write_tube
+from tests.values import ramp_to
 
-RAMP = [[0.0, 0.0], [1.0, 1.0]]
+RAMP = ramp_to(1.0)
 LOAD = {"kind": "pressure", "face": "outer", "value": 1.0, "ramp": RAMP}
 NAMES = {"regions": "media", "loads": "wall", "supports": "outer"}  # that some base has
 # one of each kind of value that TOML has, and what some keys ask for; None is a key that is not there

@@ -29,6 +29,7 @@ from remodel_fenicsx.schema.tables import SceneError, allowed, locate, format_va
 from remodel_fenicsx.schema.text import set_nested
 from tests.runs import rows_of
 from tests.tables import rows, values
+from tests.values import ramp_to, ramped
 
 ROOT = Path(__file__).resolve().parents[2]
 DEMOS = sorted((ROOT / "demos").glob("*.toml"))
@@ -36,7 +37,7 @@ PAPER = "kuhl-holzapfel-2007"
 
 TUBE: dict[str, Any] = {
     "geometry": {"shape": "tube", "inner_radius": 1.0, "outer_radius": 3.0, "length": 8.0},
-    "loads": {"pressure": {"value": 4.8, "ramp": [[0.0, 0.0], [25.0, 1.0]]}},
+    "loads": ramped(25.0, pressure=4.8),
     "time": {"end": 30.0, "step": 1.0},
 }
 CUBE: dict[str, Any] = {"geometry": {"shape": "cube"}, "time": {"end": 10.0}}
@@ -479,7 +480,7 @@ def test_a_wall_too_soft_for_its_pressure_is_warned_of():
         "material.lame_lambda": 3000.0,
     }
     thin = preset_scene(PAPER, "tube").with_values(
-        {**changes, "time.end": 1.0, "loads.pressure.ramp": [[0, 0], [1, 1]]}
+        {**changes, "time.end": 1.0, "loads.pressure.ramp": ramp_to(1)}
     )
     wall = math.log(1.02)
     (words,) = too_soft(thin.with_values({"loads.pressure.value": 600.0 * wall}))

@@ -18,9 +18,10 @@ from remodel_fenicsx.solver.continuation import Continuation
 from remodel_fenicsx.solver.equilibrium import StateLimits
 from remodel_fenicsx.solver.newton import GuardedNewton, SolveFailure, Solution
 from remodel_fenicsx.solver.diagnosis import diagnose_failure
+from tests.conftest import warnings_of
 from tests.locking_bodies import thick_tube
 from tests.runs import made
-from tests.values import ramped, isotropic
+from tests.values import isotropic, ramp_to, ramped
 
 LARGEST = (
     0.3018  # pressure of this tube: tests/reference/march.py, with the inner radius prescribed
@@ -46,10 +47,6 @@ def radii(scene: Scene) -> tuple[list[float], int]:
     )
 
 
-def warnings(caplog: pytest.LogCaptureFixture) -> list[str]:
-    return [record.getMessage() for record in caplog.records if record.levelno >= logging.WARNING]
-
-
 @pytest.mark.parametrize(("pressure", "step"), [(0.5, 0.25), (0.5, 0.05), (0.3624, 0.2)])
 def test_a_limit_point_that_is_jumped_over_is_named(
     pressure: float, step: float, caplog: pytest.LogCaptureFixture
@@ -61,7 +58,7 @@ def test_a_limit_point_that_is_jumped_over_is_named(
         )
     )
     assert max(np.diff(found)) > 1.5
-    (said,) = warnings(caplog)
+    (said,) = warnings_of(caplog)
     assert "limit point" in said and "a smaller time.step" in said
     place = re.search(r"The previous branch ends at pressure ([0-9.]+) \(", said)
     assert place is not None and float(place[1]) == pytest.approx(LARGEST, rel=5e-3)
@@ -88,7 +85,7 @@ def test_a_far_step_with_a_way_to_it_says_nothing(
         "geometry.outer_radius": 3.0,
         "supports.ends": "free",
     }
-    changes |= {"loads.elongation": {"value": 0.0, "ramp": [[0.0, 0.0], [1.0, 1.0]]}}
+    changes |= {"loads.elongation": {"value": 0.0, "ramp": ramp_to(1.0)}}
     looked, confirm = [], Continuation.repeat_in_substeps
     monkeypatch.setattr(
         Continuation,
@@ -96,7 +93,7 @@ def test_a_far_step_with_a_way_to_it_says_nothing(
         lambda *arguments: looked.append(1) or confirm(*arguments),
     )
     (whole,), _ = radii(thin_tube(3.15, **changes))
-    assert looked and not warnings(caplog)
+    assert looked and not warnings_of(caplog)
     small, _ = radii(thin_tube(3.15, **changes, **{"time.step": 0.1}))
     assert whole == pytest.approx(small[-1], rel=1e-8)
 
@@ -156,7 +153,7 @@ def test_a_body_that_jumps_again_and_again_is_looked_into_three_times(
     )
     found, _ = radii(scene)
     assert sum(np.abs(np.diff(found)) > 1.0) >= 4
-    assert len(warnings(caplog)) == 3
+    assert len(warnings_of(caplog)) == 3
 
 
 def test_parts_of_quasi_newton_steps_are_no_jump() -> None:

@@ -12,8 +12,10 @@ from remodel_fenicsx.simulation import Simulation
 from remodel_fenicsx.solver.continuation import StepFailure
 from remodel_fenicsx.solver.newton import Convergence
 from tests import parts
+from tests.body.test_cube import closed_form_angle
 from tests.parts import cube
 from tests.reference.radial import RadialMaterial, Tube
+from tests.values import ramp_to
 
 PAPER = "kuhl-holzapfel-2007"
 
@@ -76,11 +78,7 @@ def test_a_residual_that_may_be_much_of_the_stress_is_said(
     for tolerance in (1e-6, 1e-1):
         changes = {**LOOSE, "time.end": 5.0, "solver.relative_tolerance": tolerance}
         list(Simulation(preset_scene("consistent", "tube").with_values(changes)).steps())
-        said = [
-            record.getMessage()
-            for record in caplog.records
-            if "slowly or not at all" in record.getMessage()
-        ]
+        said = [line for line in caplog.messages if "slowly or not at all" in line]
         assert len(said) == (tolerance == 1e-1), tolerance
     assert "Lower solver.relative_tolerance" in said[0]
 
@@ -89,8 +87,7 @@ def test_weak_tension_remodels_as_strong_tension_does() -> None:
     """The threshold is no load of anybody's: a stress of 1e-6 of the matrix's stiffness is a tension."""
     scene = preset_scene(PAPER, "cube").with_values({"loads.force.value": 3e-5, "time.end": 2.0})
     _, second = Simulation(scene).steps()
-    s = 1 - np.exp(-0.025)
-    expected = np.degrees(np.arctan2(np.sqrt(2) * (1 - s), 1 - s + np.sqrt(3) * s))
+    expected = closed_form_angle(0.025, 1.0)
     assert second.row["mean_fibre_angle"] == pytest.approx(expected, abs=1e-8)
 
 
@@ -102,7 +99,7 @@ def test_a_small_force_on_a_slender_body_is_solved() -> None:
         "time.end": 1.0,
         "loads.force.value": 3e-6,
     }
-    changes |= {"loads.force.ramp": [[0.0, 0.0], [1.0, 1.0]], "geometry.area": 1.0}
+    changes |= {"loads.force.ramp": ramp_to(1.0), "geometry.area": 1.0}
     stretches = []
     for length in (10.0, 1e4):
         scene = preset_scene(PAPER, "tendon").with_values({**changes, "geometry.length": length})
@@ -136,7 +133,7 @@ THIN = {
     "material.lame_lambda": 3.103e4,
     "loads.pressure.value": 0.05,
     "loads.elongation.value": 0.0,
-    "loads.pressure.ramp": [[0.0, 0.0], [8.0, 1.0]],
+    "loads.pressure.ramp": ramp_to(8.0),
     "remodeling.law": "none",
     "time.end": 8.0,
 }
@@ -185,7 +182,7 @@ def test_a_stiff_wall_with_residual_stress_is_solved() -> None:
         "time.end": 16.0,
     }
     for name in ("pressure", "elongation"):
-        stiff[f"loads.{name}.ramp"] = [[0.0, 0.0], [8.0, 1.0]]
+        stiff[f"loads.{name}.ramp"] = ramp_to(8.0)
     stiff |= {"remodeling.law": "tensor", "remodeling.kappa": 0.025}
     steps = list(Simulation(preset_scene(PAPER, "tube").with_values(stiff)).steps())
     assert len(steps) == 16 and max(step.work.newton_iterations for step in steps) < 60
@@ -213,6 +210,5 @@ def test_chains_near_their_contour_length_are_solved_to_rounding() -> None:
     steps = list(Simulation(scene).steps())
     assert len(steps) == 12 and steps[-1].row["force"] == 10.0
     assert all(step.row["max_chain_extension"] < 1.0 for step in steps)
-    s = 1 - np.exp(-0.025 * 11.0)
-    expected = np.degrees(np.arctan2(np.sqrt(2) * (1 - s), 1 - s + np.sqrt(3) * s))
+    expected = closed_form_angle(0.025, 11.0)
     assert steps[-1].row["mean_fibre_angle"] == pytest.approx(expected, abs=1e-8)

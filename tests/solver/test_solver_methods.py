@@ -19,10 +19,11 @@ from remodel_fenicsx.solver.newton import GuardedNewton
 from tests import parts
 from tests.parts import tube
 from tests.runs import made
+from tests.values import ramp_to
 
 SELF = MPI.COMM_SELF
-TUBE = {"geometry.length": 2.0, "time.end": 8.0, "loads.pressure.ramp": [[0.0, 0.0], [5.0, 1.0]],
-        "loads.elongation.ramp": [[0.0, 0.0], [5.0, 1.0]], "solver.predictor": "none"}  # fmt: skip
+TUBE = {"geometry.length": 2.0, "time.end": 8.0, "loads.pressure.ramp": ramp_to(5.0),
+        "loads.elongation.ramp": ramp_to(5.0), "solver.predictor": "none"}  # fmt: skip
 
 
 def simulated(method: str, **changes: Any) -> tuple[Simulation, list[dict[str, float]]]:
@@ -149,7 +150,7 @@ def test_factors_of_every_kind(caplog: pytest.LogCaptureFixture) -> None:
         ("mumps", "lu"),
     )
     assert kinds == [cholmod, symmetric, unsymmetric, cholmod, cholmod]
-    assert [record.message for record in caplog.records] == [
+    assert caplog.messages == [
         "Cholesky factorisation of the tangent failed (tried in this order: Cholesky, LDL^T, LU)"
     ]
     factor.renew(matrix_of(np.zeros((30, 30))))
@@ -233,7 +234,7 @@ def test_where_old_factors_do_not_do_every_tangent_is_taken(
     caplog.set_level(logging.INFO)
     monkeypatch.setattr(Lagged, "_costs_more", lambda self, tolerance: False)
     changes = {
-        "loads.pressure.ramp": [[0.0, 0.0], [2.0, 1.0]],
+        "loads.pressure.ramp": ramp_to(2.0),
         "time.end": 3.0,
         "solver.maximum_iterations": 8,
     }
@@ -309,7 +310,7 @@ def test_a_solve_that_the_guards_hold_up_goes_on_in_substeps(
 ) -> None:
     """Here with a limit that this step reaches; it comes to the same state."""
     caplog.set_level(logging.INFO)
-    changes = {"loads__pressure__ramp": [[0.0, 0.0], [1.0, 1.0]], "time__end": 1.0}
+    changes = {"loads__pressure__ramp": ramp_to(1.0), "time__end": 1.0}
     changes["loads__pressure__value"] = 12.0
     simulation, expected = simulated(method, **changes)
     simulation.close()

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import csv
 import signal
 from contextlib import closing
 from pathlib import Path
@@ -22,6 +21,7 @@ from remodel_fenicsx.studies.study import Study, TooFewRuns
 from remodel_fenicsx.system.interrupts import Paused
 from tests.conftest import Refused, forked_children
 from tests.parts import pulled_cube
+from tests.tables import of_csv
 
 END = 5.0
 
@@ -73,7 +73,7 @@ def test_the_table_is_that_of_the_runs(made: tuple[Path, study.Ensemble]) -> Non
     folder, _ = made
     runs = [Recording(folder / name) for name in ("seed-1", "seed-3")]
     assert [run.scene.cells.seed for run in runs] == [1, 3]
-    rows = list(csv.DictReader((folder / "ensemble.csv").read_text().splitlines()))
+    rows = of_csv(folder / "ensemble.csv")
     found = [
         [float(row[f"mean_stretch_{kind}"]) for row in rows] for kind in ("mean", "std", "max")
     ]

@@ -19,9 +19,10 @@ from remodel_fenicsx import Scene, SceneError, Simulation, cli, preset_scene, re
 from remodel_fenicsx.schema.settings import STRESS_UNITS
 from remodel_fenicsx.simulation import reset_simulation
 from remodel_fenicsx.studies.fit import Problem, data_warnings, fit, minimised, read_measurements
-from tests.conftest import Refused, forked_children
+from tests.conftest import Refused, forked_children, warnings_of
 from tests.runs import last_row, rows_of
-from tests.tables import rows
+from tests.tables import of_csv, rows
+from tests.values import ramp_to, ramped
 
 ROOT, FITS = Path(__file__).parents[2], Path(__file__).with_name("fits")
 TRUTH = {"material.lame_mu": 3.0, "material.chain_density": 2e21, "remodeling.kappa": 0.05}
@@ -51,7 +52,7 @@ def inflated() -> list[dict[str, float]]:
         "time.step": 1.0,
         "loads.pressure.ramp": ramp,
     }
-    return rows_of(tube(**changes, **{"loads.elongation.ramp": [[0.0, 0.0], [1.0, 1.0]]}))
+    return rows_of(tube(**changes, **{"loads.elongation.ramp": ramp_to(1.0)}))
 
 
 @pytest.fixture(scope="module")
@@ -114,8 +115,7 @@ def test_the_numbers_that_made_the_data_are_found(
     assert cli.main(words) == 0
     said = capsys.readouterr().out
     assert "2 of 3 starts end in this minimum" in said
-    with (out / "fit.csv").open() as file:
-        table = list(csv.DictReader(file))
+    table = of_csv(out / "fit.csv")
     assert [row["key"] for row in table] == list(TRUTH)
     for row in table:
         assert float(row["value"]) == pytest.approx(TRUTH[row["key"]], rel=1e-3)
@@ -172,9 +172,8 @@ def test_profiles_of_what_goes_together(folder: Path) -> None:
         warnings.simplefilter("error")
         assert wide.open == ["both", "both"]
         np.testing.assert_allclose(wide.band, found.problem.bounds.T)
-    with (folder / "out" / "fit.csv").open() as file:
-        ends = [float(row["profile_upper"]) for row in csv.DictReader(file)]
-    assert ends[1] == pytest.approx(upper, rel=1e-6)
+    end = of_csv(folder / "out" / "fit.csv")[1]["profile_upper"]
+    assert float(end) == pytest.approx(upper, rel=1e-6)
 
 
 PAIR = (FITS / "pair.toml").read_text()
@@ -406,8 +405,7 @@ def test_the_page_leads_from_a_curve_to_numbers(
         )
         == 0
     )
-    with Path("found/fit.csv").open() as file:
-        table = {row["key"]: row for row in csv.DictReader(file)}
+    table = {row["key"]: row for row in of_csv(Path("found/fit.csv"))}
     said = re.findall(r"^\| `(\w+)` \| ([\d.]+).* \| ([\d.]+) to ([\d.]+) \|$", page, re.MULTILINE)
     assert len(said) == 3
     for key, value, low, high in said:
@@ -431,7 +429,7 @@ def stretched(network: dict[str, float]) -> Scene:
             **network,
         },
         cells={"initial": "aligned"},
-        loads={"force": {"value": 4184.0, "ramp": [[0.0, 0.0], [10.0, 1.0]]}},
+        loads=ramped(10.0, force=4184.0),
         remodeling={"law": "none"},
         time={"end": 10.0},
     )
@@ -539,7 +537,7 @@ def test_loads_of_another_kind_are_doubted(
     )
     data = written(tmp_path, {"material.lame_mu": 3.0}, "d.csv", "nominal_stress_x = 0.1")
     read_measurements(data, read_scene(ROOT / "demos" / "sheet.toml"))
-    found = [record.getMessage() for record in caplog.records if record.levelname == "WARNING"]
+    found = warnings_of(caplog)
     assert len(found) == bool(said) and all(
         line.startswith(f"d.csv, {column}: {said}") for line in found
     )

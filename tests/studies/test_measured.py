@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import csv
-import logging
 from pathlib import Path
 from runpy import run_path
 
@@ -12,8 +10,8 @@ import pytest
 
 from remodel_fenicsx import Scene, SceneError, cli, read_scene
 from remodel_fenicsx.studies.fit import Measured, read_measurements
-from tests.conftest import forked_children
-from tests.tables import rows as table_rows, unescaped
+from tests.conftest import forked_children, warnings_of
+from tests.tables import of_csv, rows as table_rows, unescaped
 
 DEMO = Path(__file__).parents[2] / "demos" / "biaxial"
 HEAD = "Tester\nTime,Test,Cycle,X,Fx,Ty\n(s),,,(mm),(N),(N/m)\n"
@@ -90,7 +88,7 @@ def test_hysteresis_above_the_standard_deviation_is_said(
     """Of the last cycle: at half of its load 360 kPa less, on the mean of three rows 1.2 times 100."""
     instrument(tmp_path, softer)
     read(tmp_path, sheet, KEYS)
-    found = [one.getMessage() for one in caplog.records if one.levelno == logging.WARNING]
+    found = warnings_of(caplog)
     assert len(found) == said
     assert not said or "d.csv, nominal_stress_x: loading and unloading differ by 1.2 " in found[0]
 
@@ -135,8 +133,7 @@ def test_the_file_of_an_instrument_is_fitted_and_predicts(
     with forked_children():
         words += ["--starts", "1", "--no-likelihood-profiles", "-o", str(tmp_path / "out")]
         assert cli.main(words) == 0
-    with (tmp_path / "out" / "fit.csv").open() as file:
-        table = {row["key"]: row for row in csv.DictReader(file)}
+    table = {row["key"]: row for row in of_csv(tmp_path / "out" / "fit.csv")}
     assert {*table} == {*truth}
     for key, row in table.items():
         assert float(row["value"]) == pytest.approx(truth[key], rel=0.5), key

@@ -12,6 +12,7 @@ import pytest
 from benchmarks.stability_map.cases import all_cases
 from benchmarks.stability_map.homogeneous import CUBE
 from benchmarks.stability_map.running import Runner, evaluated
+from tests.body.test_cube import closed_form_angle
 from tests.reference.march import Bar, march, material
 from tests.reference.point import prescribed_path
 from tests.reference.solid import smallest_eigenvalue
@@ -74,10 +75,8 @@ def test_the_table_of_known_faults_has_no_other_cases() -> None:
 def test_the_point_knows_the_closed_form() -> None:
     """The cube's angle (demos/cube.toml), whatever the stretch."""
     path = march(CUBE, Bar(CUBE))
-    s = -np.expm1(
-        -0.025 * (np.array(path.times) - 1)
-    )  # the row's cells are those of the step before
-    angle = np.degrees(np.arctan2(np.sqrt(2) * (1 - s), 1 - s + np.sqrt(3) * s))
+    # the cells of a row are those of the step before
+    angle = closed_form_angle(0.025, np.array(path.times) - 1)
     np.testing.assert_allclose(path.angle(), angle, rtol=1e-12)
     held = smallest_eigenvalue(np.ones(3), np.full(3, 1 / 3), material(CUBE))
     assert held == pytest.approx(1.0)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import csv
 import os
 import shutil
 from pathlib import Path
@@ -16,7 +15,7 @@ from remodel_fenicsx.results.status import status
 from remodel_fenicsx.studies.study import label_of_key
 from remodel_fenicsx.studies.sweep import latin_hypercube, read_axes, sweep
 from tests.conftest import Refused, forked_children
-from tests.tables import rows as table
+from tests.tables import of_csv, rows as table
 
 PAPER = "kuhl-holzapfel-2007"
 
@@ -48,8 +47,7 @@ def test_keys_are_those_of_people_from_python_too(tmp_path: Path) -> None:
 
 
 def rows(folder: Path) -> list[dict[str, str]]:
-    with (folder / "sweep.csv").open() as file:
-        return list(csv.DictReader(file))
+    return of_csv(folder / "sweep.csv")
 
 
 def test_the_ends_follow_the_closed_form(

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import csv
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -18,6 +17,7 @@ from remodel_fenicsx.scene.scene import Scene, preset_scene
 from remodel_fenicsx.studies import trade
 from tests.conftest import forked_children
 from tests.reference.radial import solve_radial
+from tests.tables import of_csv
 
 PAPER = "kuhl-holzapfel-2007"
 SMOOTH = np.array([[1.0, 2.0, -1.0], [0.5, 1.0, 0.0]])
@@ -175,8 +175,7 @@ def test_the_command(
     before = {file: file.stat().st_mtime_ns for file in out.glob("*/history.csv")}
     (out / f"{names[2]}-1").unlink()
     assert traded(out)[0] == 0 and {file: file.stat().st_mtime_ns for file in before} == before
-    with (out / "trade.csv").open() as file:
-        table = sorted(csv.DictReader(file), key=lambda entry: names.index(entry["setting"]))
+    table = sorted(of_csv(out / "trade.csv"), key=lambda entry: names.index(entry["setting"]))
     assert list(table[0])[:5] == [
         "setting",
         "scene",

@@ -13,6 +13,7 @@ import pytest
 from remodel_fenicsx import Scene
 from tests.runs import rows_of
 from tests.tables import rows as table
+from tests.values import ramp_to
 
 SCRIPT = runpy.run_path(str(Path(__file__).parents[2] / "demos" / "which_numbers.py"))
 ABSURD = [
@@ -88,7 +89,7 @@ def test_the_sheet_of_its_numbers_has_the_stresses_of_the_paper(
     tables["material"]["lame_lambda"] *= 100  # incompressible, as the paper's
     stress = SCRIPT["of_papers"](2.4, 0.84, cells, 0.2, 3.0)
     for across in (True, False):
-        pulled = {"value": 0.3, "ramp": [[0.0, 0.0], [6.0, 1.0]]}
+        pulled = {"value": 0.3, "ramp": ramp_to(6.0)}
         loads = {"elongation_x": pulled} | ({"elongation_y": pulled} if across else {})
         sheet = {
             "geometry": {"shape": "sheet"},

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import csv
 from pathlib import Path
 
 import numpy as np
@@ -14,6 +13,7 @@ from remodel_fenicsx.scene import preset_scene
 from remodel_fenicsx.simulation import Simulation
 from remodel_fenicsx.studies.stability import Analysis, FactorWatcher
 from tests.conftest import Refused
+from tests.tables import of_csv
 from tests.watch.test_over_correction import Tilt
 
 PAPER = "kuhl-holzapfel-2007"
@@ -57,8 +57,7 @@ def test_the_command_writes_table_and_picture(
             "-q",
         ]
         assert main(["stability", *arguments]) == 0
-        with (folder / "stability.csv").open() as file:
-            table = list(csv.DictReader(file))
+        table = of_csv(folder / "stability.csv")
         assert [(list(row), row["time"]) for row in table] == [
             (["time", "factor"], "7"),
             (["time", "factor"], "14"),

@@ -15,7 +15,7 @@ from remodel_fenicsx import Scene
 from remodel_fenicsx.watch.stability import BucklingWarning
 from tests.parts import tube
 from tests.runs import made, simulated
-from tests.values import isotropic
+from tests.values import isotropic, ramp_to
 
 MU, LAME = 3.103, 27.293
 YOUNG, POISSON = MU * (3 * LAME + 2 * MU) / (LAME + MU), LAME / (2 * (LAME + MU))
@@ -29,7 +29,7 @@ SECOND_MOMENT = np.pi / 4 * (1.5**4 - 1)
 
 def ramped(value: float) -> dict[str, Any]:
     """A load that is all there from t = 1."""
-    return {"value": value, "ramp": [[0.0, 0.0], [1.0, 1.0]]}
+    return {"value": value, "ramp": ramp_to(1.0)}
 
 
 def slender(kinematics: str, pressure: float, **changes: Any) -> Scene:
@@ -119,11 +119,7 @@ def test_who_is_told(scene: Scene, told: str, caplog: Any) -> None:
     longer = scene.with_values({"time.end": 2.0})
     with caplog.at_level(logging.WARNING), watched(longer):
         pass
-    lines = [
-        record.getMessage()
-        for record in caplog.records
-        if "expected buckling" in record.getMessage()
-    ]
+    lines = [line for line in caplog.messages if "expected buckling" in line]
     assert len(lines) == bool(told), lines
     for line in lines:
         assert f"axial {told} is about " in line and "set model.kinematics = 'full'" in line

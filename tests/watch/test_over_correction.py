@@ -66,9 +66,7 @@ def test_the_angle_under_a_weak_load_is_the_closed_form(
     simulation = cube(force, remodeling__frame=frame)
     with caplog.at_level(logging.WARNING, logger="remodel_fenicsx"):
         *_, last = simulation.steps()
-    np.testing.assert_allclose(
-        angles(simulation), closed_form_angle(KAPPA, np.array(END)), rtol=0, atol=1e-8
-    )
+    np.testing.assert_allclose(angles(simulation), closed_form_angle(KAPPA, END), rtol=0, atol=1e-8)
     share = 1 - np.exp(-KAPPA * (END - 1.0))
     across = (1 - share) / np.sqrt(3)
     assert last.row["mean_stretch"] == pytest.approx(
@@ -87,10 +85,7 @@ def test_a_tilt_that_grows_is_warned_of_before_the_angle_is_off(
         for step in simulation.steps([Tilt(simulation, 20.0, 1e-8)]):
             if "overshoots" in caplog.text:
                 warned.append(step.time)
-            if (
-                abs(np.mean(angles(simulation)) - closed_form_angle(KAPPA, np.array(step.time)))
-                > 0.5
-            ):
+            if abs(np.mean(angles(simulation)) - closed_form_angle(KAPPA, step.time)) > 0.5:
                 off.append(step.time)
     assert bool(warned) == bool(off) == swings
     if swings:
