@@ -2,20 +2,28 @@
 """How time and memory grow with the body: the artery on finer meshes, on one rank and on two.
 
     ./with-fenicsx benchmarks/scaling.py [--unknowns N]... [--ranks N]... [--steps 3] [--method auto]    # measures
-    ./with-fenicsx benchmarks/scaling.py --report       # the table, of which docs/reliability.md has some numbers
+    ./with-fenicsx benchmarks/scaling.py --report       # the table (docs/reliability.md)
+    ./with-fenicsx benchmarks/scaling.py --aorta SIZE [--ranks N]    # an arch with three branches
 
 Each case is a run of its own (the paper's tube, random cells, no fields, predictor on) with the mesh whose number of
 unknowns is nearest to N; its first load steps are solved. Results are lines of results/scaling.jsonl: wall and
 processor seconds of a step after the first, Newton and linear iterations, peak memory of all ranks. Cases that are
 there are measured again and replaced. Wall time says something on an idle machine only.
+
+The aorta goes from the surface of its lumen (benchmarks/arch.py) through the commands of a user with
+the program's defaults: a wall of 1.2 mm of triangles of SIZE mm, two load steps of a quarter of 80
+mmHg, 20 steps of remodeling after the load, and `unload` on one rank. 250,000 unknowns have a size of 3, 1,000,000
+one of 1.5. Its folder is results/aorta-SIZE.
 """
 
 from __future__ import annotations
 
 import argparse
+import csv
 import json
 import os
 import resource
+import shutil
 import subprocess
 import sys
 import time as clock
@@ -24,6 +32,7 @@ from typing import Any
 
 from mpi4py import MPI
 
+from benchmarks.arch import write_lumen
 from docs.making.pages import lines, markdown
 from remodel_fenicsx.body.tube import Tube, whole_tube
 from remodel_fenicsx.scene import preset_scene
@@ -141,6 +150,70 @@ def row(record: dict) -> list[str]:
     ]
 
 
+AORTA = """
+[geometry]
+shape = "mesh"
+file = "wall.msh"
+length_unit = "mm"
+[geometry.faces]
+outlet = ["outlet_1", "outlet_2", "outlet_3", "outlet_4"]
+[material]
+stress_unit = "kPa"
+lame_lambda = 540.0
+lame_mu = 60.0
+chain_density = 6e25
+[cells]
+initial = "isotropic"
+[supports.inlet]
+kind = "guided"
+[supports.outlet]
+kind = "guided"
+[loads.pressure]
+value = "80 mmHg"
+ramp = [[0.0, 0.0], [4.0, 1.0]]
+[remodeling]
+law = "tensor"
+kappa = 0.025
+[time]
+end = 24.0
+step = 1.0
+"""
+
+
+def aorta(size: float, ranks: int) -> None:
+    """Run a user's commands on the arch; print a row of time, memory and iterations of each."""
+    folder = RESULTS.parent / f"aorta-{size:g}"
+    shutil.rmtree(folder, ignore_errors=True)
+    folder.mkdir(parents=True)
+    (folder / "aorta.toml").write_text(AORTA)
+    triangles = write_lumen(folder / "lumen.vtp")
+    print(f"{triangles} triangles of the lumen", flush=True)
+    wall = ["wall", "lumen.vtp", "--thickness", "1.2", "--size", f"{size:g}", "-o"]
+    unload = ["unload", "aorta.toml", "--set", "geometry.is=loaded", "-o"]
+    commands = {
+        "wall": (1, wall),
+        "two load steps": (ranks, ["run", "aorta.toml", "--set", "time.end=2.0", "-o"]),
+        "20 steps of remodeling": (ranks, ["run", "aorta.toml", "-o"]),
+        "unload": (1, unload),
+    }
+    print(markdown(["command", "wall s", "processor s", "GB", "Newton its"], []))
+    for name, (processes, command) in commands.items():
+        start = ["mpirun", "-n", str(processes), "--bind-to", "none"] if processes > 1 else []
+        begun = clock.perf_counter()
+        output = "wall.msh" if name == "wall" else name.replace(" ", "_")
+        started = [*start, "remodel-fenicsx", *command, output]
+        process = subprocess.Popen(started, cwd=folder)
+        _, status, usage = os.wait4(process.pid, 0)
+        table = folder / output / "history.csv"
+        rows = list(csv.DictReader(table.open())) if table.is_file() else []
+        newton = sum(int(float(row["newton_iterations"])) for row in rows)
+        seconds = (clock.perf_counter() - begun, usage.ru_utime + usage.ru_stime)
+        numbers = (*seconds, usage.ru_maxrss / 1e6)
+        print(lines([[name, *(f"{number:.3g}" for number in numbers), f"{newton}"]]), flush=True)
+        if status:
+            sys.exit(f"{name}: exit code {os.waitstatus_to_exitcode(status)}")
+
+
 def main() -> None:
     """Measure, or report."""
     parser = argparse.ArgumentParser(
@@ -150,9 +223,13 @@ def main() -> None:
     parser.add_argument("--ranks", type=int, action="append")
     parser.add_argument("--steps", type=int, default=3)
     parser.add_argument("--method", default="auto")
+    parser.add_argument("--aorta", type=float, metavar="SIZE")
     parser.add_argument("--case", type=int, help=argparse.SUPPRESS)
     parser.add_argument("--report", action="store_true")
     options = parser.parse_args()
+    if options.aorta:
+        aorta(options.aorta, *(options.ranks or [1])[:1])
+        return
     if options.case:
         measure(options.case, options.steps, options.method)
         return

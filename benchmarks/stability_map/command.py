@@ -70,7 +70,7 @@ def chosen(options: argparse.Namespace, parser: argparse.ArgumentParser) -> dict
         and (not options.reduced or case.reduced)
     }
     if not cases:
-        parser.error(f"no such case; families are {', '.join(FAMILIES)}")
+        parser.error(f"no such case; families are {', '.join(FAMILIES)}; see --list")
     return cases
 
 
