@@ -450,6 +450,9 @@ def _read_columns(
             )
         factor, by = _factor(name, unit, table, f"{key} = {format_value(unit)}", scene)
         columns[name] *= factor
+        if name in table.sd:
+            words = f"its standard deviation is {table.sd[name]:g} in the scene's unit"
+            log.info("%s, %s: %s, %.3g %s", path.name, name, words, table.sd[name] / factor, unit)
         if not by:
             units[name] = unit, factor
     # These warnings come before any solve, which may fail because of their cause.
@@ -1145,7 +1148,7 @@ class Fit(StudyResult):
         pairs = np.argwhere(np.triu(np.abs(self.correlations) > CORRELATED, 1))
         together = [f"{keys[i]} and {keys[j]} ({self.correlations[i, j]:+.2f})" for i, j in pairs]
         if together:
-            text += f" Correlated: {', '.join(together)}; take their intervals from --profiles."
+            text += f" Correlated: {', '.join(together)}; trust their profile likelihoods."
         return text
 
     @property
