@@ -134,7 +134,8 @@ def chains(body: pyvista.UnstructuredGrid) -> pyvista.PolyData:
     drawn = pyvista.PolyData(
         (middle[:, None] + arms).reshape(-1, 3), lines=np.insert(lines, 0, 2, axis=1)
     )
-    return drawn.tube(radius=CHAIN_LOOK["width"] / 2 * float(np.median(size[size > 0])), n_sides=6)
+    drawn["radius"] = np.repeat(CHAIN_LOOK["width"] / 2 * size, 8)
+    return drawn.tube(scalars="radius", absolute=True, n_sides=6)
 
 
 def _width(corners: Array) -> Array:
@@ -145,10 +146,10 @@ def _width(corners: Array) -> Array:
 
 # ---------------------------------------------------------------- pictures, by a child process
 
-LETTER, NOTE = 15, 11  # font sizes
+LETTER, NOTE = 15, 12  # font sizes
 PANEL = 600  # pixels: height of a body with its title
 FOOT = 150  # pixels: height of the footer
-ZOOM = 0.8  # leaves space for the title
+ZOOM = 1.7  # twice the fraction of a panel that a body fills, which leaves space for the title
 
 
 class Job(NamedTuple):
@@ -205,15 +206,21 @@ def _drawn(
     """Draw the bodies of a sheet next to each other, at one scale."""
     columns = min(len(sheet), MOST_COLUMNS)
     rows = math.ceil(len(sheet) / columns)
+    up = (0, 1, 0) if math.hypot(*job.direction[:2]) < 0.01 * abs(job.direction[2]) else (0, 0, 1)
+    across = np.cross(up, job.direction)
+    wide, tall = (
+        np.abs(axis) @ (bounds[1::2] - bounds[::2]) / np.linalg.norm(axis)
+        for axis in (across, np.cross(across, job.direction))
+    )
+    width = int(PANEL * np.clip(wide / tall, 0.6, 1.2))
     plotter: Any = new_plotter(
         off_screen=True,
-        window_size=[max(800, PANEL * columns), PANEL * rows + FOOT],
+        window_size=[max(800, width * columns), PANEL * rows + FOOT],
         shape=(rows + 1, columns),
         row_weights=[*[PANEL] * rows, FOOT],
         groups=[(rows, slice(None))],
         border=False,
     )
-    up = (0, 1, 0) if math.hypot(*job.direction[:2]) < 0.01 * abs(job.direction[2]) else (0, 0, 1)
     for number, (title, body) in enumerate(sheet):
         plotter.subplot(*divmod(number, columns))
         actor = add_body(
@@ -222,26 +229,21 @@ def _drawn(
         plotter.add_text(title, "upper_edge", LETTER, "black")
         plotter.enable_parallel_projection()
         plotter.view_vector(job.direction, up, bounds=bounds)
-        plotter.camera.zoom(ZOOM)
+        plotter.camera.parallel_scale = np.maximum(tall, wide * PANEL / width) / ZOOM
     plotter.subplot(rows, 0)
     plotter.view_vector(job.direction, up)
-    look = {
-        "n_labels": 7,
-        "fmt": "%.0f°" if job.field == ANGLE else "%.3g",
-        "color": "black",
-        "label_font_size": LETTER,
-    }
     plotter.add_scalar_bar(
-        job.scale,
+        "",
         mapper=actor.mapper,
-        width=0.6,
         height=0.45,
         position_x=0.2,
         position_y=0.5,
-        **look,
+        n_labels=7,
+        fmt="%.0f°" if job.field == ANGLE else "%.3g",
+        label_font_size=LETTER,
     )
-    plotter.add_text(job.notes, "lower_edge", NOTE, "black")
-    plotter.add_axes(viewport=(0.84, 0.0, 1.0, 1.0), color="black")
+    plotter.add_text(f"{job.scale}\n{job.notes}", "lower_edge", NOTE, "black")
+    plotter.add_axes(viewport=(0.84, 0.0, 1.0, 1.0))
     image = Image.fromarray(np.asarray(plotter.screenshot(return_img=True, scale=2)))
     plotter.close()
     return np.asarray(image.reduce(2))  # antialiasing with every VTK
@@ -386,25 +388,24 @@ def _draw(
     images = render(Job(drawn, *look))
     first, *others = map(Image.fromarray, images)
     texts, title = PngInfo(), f"{scene.name}: {label}"
-    source = "; ".join(f"{name} {version}" for name, version in recording.versions.items())
-    about = {
-        "Title": title,
-        "Description": notes,
-        "Software": f"remodel_fenicsx {__version__}",
-        "Source": source,
-    }
-    for key, value in about.items():
-        texts.add_text(key, value)
-    durations = [FRAME_TIME] * len(others) + [LAST_TIME]
-    moving: dict[str, Any] = {
+    texts.add_text("Title", title)
+    texts.add_text("Description", notes)
+    texts.add_text("Software", f"remodel_fenicsx {__version__}")
+    texts.add_text("Source", "; ".join(map(" ".join, recording.versions.items())))
+    moving = {
         "save_all": True,
         "append_images": others,
         "loop": 0,
-        "duration": durations,
+        "duration": [FRAME_TIME] * len(others) + [LAST_TIME],
     }
     file = io.BytesIO()
-    kind = (path.suffix.lower() if path else ending)[1:]
-    first.save(file, kind, pnginfo=texts, title=title, **(moving if others else {}))
+    first.save(
+        file,
+        (path.suffix.lower() if path else ending)[1:],
+        pnginfo=texts,
+        title=title,
+        **(moving if others else {}),
+    )
     stem = "-".join(
         [scene.name, *dict.fromkeys(f"t{times[0]:g}" for times in (sheets[0], sheets[-1][-1:]))]
     )
