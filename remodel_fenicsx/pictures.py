@@ -139,15 +139,15 @@ def chains(body: pyvista.UnstructuredGrid) -> pyvista.PolyData:
 
 
 def _width(corners: Array) -> Array:
-    """Return the shortest nonzero side of each face (m,) from its corners (m, k, 3)."""
-    sides = np.linalg.norm(corners - np.roll(corners, 1, axis=1), axis=2)
-    return np.where(sides > 0, sides, np.inf).min(axis=1)
+    """Return twice the distance from the middle of each face (m, k, 3) to its closest side (m,)."""
+    sides = (corners + np.roll(corners, 1, axis=1)) / 2 - corners.mean(axis=1, keepdims=True)
+    return 2 * np.linalg.norm(sides, axis=2).min(axis=1)
 
 
 # ---------------------------------------------------------------- pictures, by a child process
 
 LETTER, NOTE = 15, 12  # font sizes
-PANEL = 600  # pixels: height of a body with its title
+PANEL = 600  # pixels: longer side of a body's panel, with its title
 FOOT = 150  # pixels: height of the footer
 ZOOM = 1.7  # twice the fraction of a panel that a body fills, which leaves space for the title
 
@@ -208,16 +208,18 @@ def _drawn(
     rows = math.ceil(len(sheet) / columns)
     up = (0, 1, 0) if math.hypot(*job.direction[:2]) < 0.01 * abs(job.direction[2]) else (0, 0, 1)
     across = np.cross(up, job.direction)
-    wide, tall = (
-        np.abs(axis) @ (bounds[1::2] - bounds[::2]) / np.linalg.norm(axis)
-        for axis in (across, np.cross(across, job.direction))
+    seen = np.array(
+        [
+            np.abs(axis) @ np.ptp(bounds.reshape(3, 2), 1) / np.linalg.norm(axis)
+            for axis in (across, np.cross(across, job.direction))
+        ]
     )
-    width = int(PANEL * np.clip(wide / tall, 0.6, 1.2))
+    width, height = (PANEL * np.maximum(seen / seen.max(), 0.6)).astype(int)
     plotter: Any = new_plotter(
         off_screen=True,
-        window_size=[max(800, width * columns), PANEL * rows + FOOT],
+        window_size=[max(800, width * columns), height * rows + FOOT],
         shape=(rows + 1, columns),
-        row_weights=[*[PANEL] * rows, FOOT],
+        row_weights=[*[height] * rows, FOOT],
         groups=[(rows, slice(None))],
         border=False,
     )
@@ -229,7 +231,7 @@ def _drawn(
         plotter.add_text(title, "upper_edge", LETTER, "black")
         plotter.enable_parallel_projection()
         plotter.view_vector(job.direction, up, bounds=bounds)
-        plotter.camera.parallel_scale = np.maximum(tall, wide * PANEL / width) / ZOOM
+        plotter.camera.parallel_scale = seen.max() * height / PANEL / ZOOM
     plotter.subplot(rows, 0)
     plotter.view_vector(job.direction, up)
     plotter.add_scalar_bar(
@@ -382,8 +384,9 @@ def _draw(
         values = [body.cell_data[field] for sheet in drawn for _, body in sheet]
         label, limits = words(field), [np.min(values), np.max(values)]
         scale = f"{label}, means of elements {unit_of(scene, 'stress')}"
-    notes = f"{scene.name}: {len(whole.elements):,} elements. "
-    notes += " ".join(whole.notes("displacement" in drawn[0][0][1].point_data))
+    notes = f"{scene.name}: {len(whole.elements):,} elements. " + " ".join(
+        whole.notes("displacement" in drawn[0][0][1].point_data)
+    )
     look = viewing.direction, field, limits, scale, textwrap.fill(notes, 110)
     images = render(Job(drawn, *look))
     first, *others = map(Image.fromarray, images)
