@@ -54,7 +54,7 @@ ANGLES = ("fibre_angle", ANGLE)  # fields in degrees, from 0 to 90
 OF_TUBES = ("deformation_gradient", "cell_dimensions", *AXIS_FIELDS)
 SHOWN_FIELDS = ("displacement", ANGLE, *OF_TUBES, *STRESS_FIELDS)
 NAN_COLOUR = "#999ea6"  # colour of points without a fibre angle
-LIFT = 0.03  # distance of chains above a face, which may be curved, over the width of the face
+LIFT = 0.015  # distance of chains above a face, which may be curved, over the width of the face
 LIGHT: dict[str, Any] = {"ambient": AMBIENT, "diffuse": 1 - AMBIENT, "specular": 0.0}
 
 
