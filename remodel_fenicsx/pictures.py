@@ -75,8 +75,8 @@ def grid(
     body = pyvista.UnstructuredGrid({kind: whole.elements}, whole.points)
     if displacement is not None:
         body.point_data["displacement"] = displacement
-    cells: dict[str, NDArray[Any]] = {"layer": whole.layer, **fields}
-    body.cell_data.update(cells)
+    body.cell_data["layer"] = whole.layer
+    body.cell_data.update({**fields})
     return body if shown is None else body.extract_cells(shown)
 
 
@@ -107,7 +107,7 @@ def add_body(
     looks: dict[str, Any] = {"scalars": name, "show_edges": True, "edge_color": "#777777", **LIGHT}
     if name in ANGLES:
         looks |= {"cmap": list(ANGLE_COLOURS), "clim": (0, 90), "nan_color": NAN_COLOUR}
-    actor = plotter.add_mesh(body, **{**looks, **options})
+    actor = plotter.add_mesh(body, **(looks | options))
     if with_chains and set(OF_TUBES) <= set(body.cell_data):
         plotter.add_mesh(chains(body), color=CHAIN_LOOK["colour"], **LIGHT)
     return actor
@@ -183,10 +183,10 @@ def render(job: Job) -> list[Pixels]:
             text=True,
         )
         result = file.with_suffix(".npy")
-        if child.returncode != 0 or not result.exists():
-            cause = f"pyvista ended with {child.returncode}: {last_line(child.stderr)}"
+        if child.returncode or not result.exists():
             raise FigureError(
-                f"rendering failed: {cause}; check that xvfb and xauth are installed",
+                f"rendering failed: pyvista ended with {child.returncode}: "
+                f"{last_line(child.stderr)}; check that xvfb and xauth are installed",
                 BAD_ENVIRONMENT,
             )
         return list(np.load(result))
@@ -196,7 +196,7 @@ def main(file: str) -> None:
     """Draw the sheets of a job file and save the pictures next to it."""
     job = pickle.loads(Path(file).read_bytes())
     bounds = np.array([body.bounds for sheet in job.sheets for _, body in sheet]).reshape(-1, 3, 2)
-    extent = np.stack([bounds[..., 0].min(axis=0), bounds[..., 1].max(axis=0)], axis=1).ravel()
+    extent = np.stack([bounds[..., 0].min(axis=0), bounds[..., 1].max(axis=0)], axis=1)
     np.save(f"{file}.npy", [_drawn(job, sheet, extent) for sheet in job.sheets])
 
 
@@ -208,12 +208,8 @@ def _drawn(
     rows = math.ceil(len(sheet) / columns)
     up = (0, 1, 0) if math.hypot(*job.direction[:2]) < 0.01 * abs(job.direction[2]) else (0, 0, 1)
     across = np.cross(up, job.direction)
-    seen = np.array(
-        [
-            np.abs(axis) @ np.ptp(bounds.reshape(3, 2), 1) / np.linalg.norm(axis)
-            for axis in (across, np.cross(across, job.direction))
-        ]
-    )
+    axes = np.array([across, np.cross(across, job.direction)])
+    seen = np.abs(axes) @ np.ptp(bounds, axis=1) / np.linalg.norm(axes, axis=1)
     width, height = (PANEL * np.maximum(seen / seen.max(), 0.6)).astype(int)
     plotter: Any = new_plotter(
         off_screen=True,
@@ -228,9 +224,9 @@ def _drawn(
         actor = add_body(
             plotter, body, job.field, show_scalar_bar=False, line_width=0.5, clim=job.limits
         )
-        plotter.add_text(title, "upper_edge", LETTER, "black")
+        plotter.add_text(title, "upper_edge", LETTER)
         plotter.enable_parallel_projection()
-        plotter.view_vector(job.direction, up, bounds=bounds)
+        plotter.view_vector(job.direction, up, bounds=bounds.ravel())
         plotter.camera.parallel_scale = seen.max() * height / PANEL / ZOOM
     plotter.subplot(rows, 0)
     plotter.view_vector(job.direction, up)
@@ -244,9 +240,9 @@ def _drawn(
         fmt="%.0f°" if job.field == ANGLE else "%.3g",
         label_font_size=LETTER,
     )
-    plotter.add_text(f"{job.scale}\n{job.notes}", "lower_edge", NOTE, "black")
+    plotter.add_text(f"{job.scale}\n{job.notes}", "lower_edge", NOTE)
     plotter.add_axes(viewport=(0.84, 0.0, 1.0, 1.0))
-    image = Image.fromarray(np.asarray(plotter.screenshot(return_img=True, scale=2)))
+    image = Image.fromarray(plotter.screenshot(scale=2))
     plotter.close()
     return np.asarray(image.reduce(2))  # antialiasing with every VTK
 
@@ -272,8 +268,10 @@ class ViewOptions(NamedTuple):
         except ValueError:
             x = y = z = math.nan
         if not 0 < math.hypot(x, y, z) < math.inf:
-            allowed = f"{', '.join(VIEWS)} or X,Y,Z, the direction from the body to the camera"
-            raise FigureError(f"view {self.view}: must be {allowed}")
+            raise FigureError(
+                f"view {self.view}: must be {', '.join(VIEWS)} or X,Y,Z, "
+                "the direction from the body to the camera"
+            )
         return x, y, z
 
 
@@ -283,8 +281,9 @@ def visible_elements(whole: WholeBody, viewing: ViewOptions) -> NDArray[np.bool_
     if layers is not None and not 1 <= layers <= count:
         shape = whole.recording.scene.geometry
         start = shape.depth_labels[1]
-        rule = f"must be an integer from 1 to {count}, from the {start}"
-        raise FigureError(f"layers {layers}: {rule}")
+        raise FigureError(
+            f"layers {layers}: must be an integer from 1 to {count}, from the {start}"
+        )
     return (whole.layer < (layers or count)) & ~_cut_off(whole, viewing.cut)
 
 
@@ -326,8 +325,9 @@ def draw_picture(
         float(recorded[np.abs(recorded - time).argmin()]) for time in times or recorded[-1:]
     )
     if len(shown) > MOST_PANELS:
-        rule = f"must be at most {MOST_PANELS} (animate shows more)"
-        raise FigureError(f"times: {len(shown)} times; {rule}")
+        raise FigureError(
+            f"times: {len(shown)} times; must be at most {MOST_PANELS} (animate shows more)"
+        )
     return _draw(whole, [[*shown]], viewing, path, ".png")
 
 
@@ -336,13 +336,15 @@ def draw_animation(
 ) -> Path:
     """Draw the body of a run over time."""
     if not FEWEST_FRAMES <= frames <= MOST_FRAMES:
-        rule = f"must be an integer from {FEWEST_FRAMES} to {MOST_FRAMES}"
-        raise FigureError(f"--frames {frames}: {rule}")
+        raise FigureError(
+            f"--frames {frames}: must be an integer from {FEWEST_FRAMES} to {MOST_FRAMES}"
+        )
     whole = _body_for(folder, path, (".gif", ".webp"))
     recorded = whole.recording.times
     if len(recorded) == 1:
-        fault = "fields are recorded at one time only; an animation needs two"
-        raise FigureError(f"{whole.recording.path}: {fault}")
+        raise FigureError(
+            f"{whole.recording.path}: fields are recorded at one time only; an animation needs two"
+        )
     return _draw(
         whole, [[float(time)] for time in kept_times(recorded, frames)], viewing, path, ".gif"
     )
@@ -387,9 +389,8 @@ def _draw(
     notes = f"{scene.name}: {len(whole.elements):,} elements. " + " ".join(
         whole.notes("displacement" in drawn[0][0][1].point_data)
     )
-    look = viewing.direction, field, limits, scale, textwrap.fill(notes, 110)
-    images = render(Job(drawn, *look))
-    first, *others = map(Image.fromarray, images)
+    job = Job(drawn, viewing.direction, field, limits, scale, textwrap.fill(notes, 110))
+    first, *others = map(Image.fromarray, render(job))
     texts, title = PngInfo(), f"{scene.name}: {label}"
     texts.add_text("Title", title)
     texts.add_text("Description", notes)
