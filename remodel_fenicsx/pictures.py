@@ -119,10 +119,13 @@ def chains(body: pyvista.UnstructuredGrid) -> pyvista.PolyData:
 
     surface = body.extract_surface().compute_normals(point_normals=False, split_vertices=False)
     faces = surface.faces.reshape(surface.n_cells, -1)[:, 1:]
-    corners = np.asarray(surface.points, dtype=float)[faces]
+    corners = surface.points[faces]
     middle = corners.mean(axis=1)
-    moved = surface.point_data.get("displacement", np.zeros((surface.n_points, 3)))[faces]
-    size = _width(corners - moved)
+    moved = surface.point_data.get("displacement", np.zeros((surface.n_points, 3)))
+    reference = corners - moved[faces]
+    sides = (reference + np.roll(reference, 1, axis=1)) / 2 - reference.mean(axis=1, keepdims=True)
+    # Twice the undeformed distance from the middle of a face to its closest side.
+    size = 2 * np.linalg.norm(sides, axis=2).min(axis=1)
     axes = np.stack([surface.cell_data[name] for name in AXIS_FIELDS], axis=1)
     lengths = surface.cell_data["cell_dimensions"]
     ends, lines = chain_lines(np.zeros_like(middle), lengths, axes, CHAIN_LOOK["reach"])
@@ -136,12 +139,6 @@ def chains(body: pyvista.UnstructuredGrid) -> pyvista.PolyData:
     )
     drawn["radius"] = np.repeat(CHAIN_LOOK["width"] / 2 * size, 8)
     return drawn.tube(scalars="radius", absolute=True, n_sides=6)
-
-
-def _width(corners: Array) -> Array:
-    """Return twice the distance from the middle of each face (m, k, 3) to its closest side (m,)."""
-    sides = (corners + np.roll(corners, 1, axis=1)) / 2 - corners.mean(axis=1, keepdims=True)
-    return 2 * np.linalg.norm(sides, axis=2).min(axis=1)
 
 
 # ---------------------------------------------------------------- pictures, by a child process
@@ -205,7 +202,7 @@ def _drawn(
 ) -> Pixels:
     """Draw the bodies of a sheet next to each other, at one scale."""
     columns = min(len(sheet), MOST_COLUMNS)
-    rows = math.ceil(len(sheet) / columns)
+    rows = -(-len(sheet) // columns)
     up = (0, 1, 0) if math.hypot(*job.direction[:2]) < 0.01 * abs(job.direction[2]) else (0, 0, 1)
     across = np.cross(up, job.direction)
     axes = np.array([across, np.cross(across, job.direction)])
@@ -264,7 +261,7 @@ class ViewOptions(NamedTuple):
         if self.view in VIEWS:
             return VIEWS[self.view]
         try:
-            x, y, z = (float(text) for text in self.view.split(","))
+            x, y, z = map(float, self.view.split(","))
         except ValueError:
             x = y = z = math.nan
         if not 0 < math.hypot(x, y, z) < math.inf:
