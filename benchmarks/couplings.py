@@ -1,5 +1,5 @@
 #!/usr/bin/env python3
-"""Which law and coupling gives most for its processor time: error against time.
+"""Which law and coupling gives most for its CPU time: error against time.
 
     ./with-fenicsx benchmarks/couplings.py              # minutes on an idle core
     ./with-fenicsx benchmarks/couplings.py --page       # only the page, from what has been measured
@@ -74,8 +74,8 @@ SCHEMES = {
     ),
 }
 CAPTION = (
-    "Error against processor time",
-    "Error of A at t = 40 (root mean square over all points, over r0^2) against processor time, each law against its "
+    "Error against CPU time",
+    "Error of A at t = 40 (root mean square over all points, over r0^2) against CPU time, each law against its "
     "own limit; points: steps of 5, 2.5, 1.25 and 0.625. (a) Isotropic cells, (b) random cells.",
 )
 Columns = dict[str, np.ndarray]
@@ -85,7 +85,7 @@ Columns = dict[str, np.ndarray]
 def layer(
     scheme: Scheme, cells: str, step: float, coupling: str
 ) -> tuple[np.ndarray, np.ndarray, float]:
-    """A and u at the end, and processor time of the steps."""
+    """A and u at the end, and CPU time of the steps."""
     changes = {
         "geometry.length": 0.5,
         "cells.initial": cells,
@@ -106,7 +106,7 @@ def layer(
 
 def errors() -> Iterator[dict[str, Any]]:
     """A row for each scheme, kind of cells and step."""
-    limits: dict[Any, tuple[np.ndarray, np.ndarray]] = {}
+    limits: dict[Any, list[np.ndarray]] = {}
     for cells in ("isotropic", "random"):
         for name, scheme in SCHEMES.items():
             printed_random = cells == "random" and scheme.values is PRINTED
@@ -118,12 +118,9 @@ def errors() -> Iterator[dict[str, Any]]:
                 fine, coarse = (
                     layer(scheme, cells, step, coupling)[:2] for step in (FINEST, 2 * FINEST)
                 )
-                share = (
-                    0.0 if printed_random else 1 / (2**order - 1)
-                )  # of a law without a limit the finest steps
-                limits[key] = fine[0] + share * (fine[0] - coarse[0]), fine[1] + share * (
-                    fine[1] - coarse[1]
-                )
+                # Without a limit: the finest steps.
+                share = 0.0 if printed_random else 1 / (2**order - 1)
+                limits[key] = [f + share * (f - c) for f, c in zip(fine, coarse, strict=True)]
             for step in STEPS:
                 tensor, unknown, spent = layer(scheme, cells, step, scheme.coupling)
                 apart = np.linalg.norm(tensor - limits[key][0], axis=(-1, -2))
@@ -136,21 +133,24 @@ def errors() -> Iterator[dict[str, Any]]:
 
 # ---------------------------------------------------------------- the page
 def draw(table: Columns) -> Figure:
-    """Error of A against processor time."""
-    figure = Figure(figsize=(7.2, 3.2))
+    """Error of A against CPU time."""
+    figure = Figure(figsize=(7.2, 3.2), layout="constrained")
     both = figure.subplots(1, 2, sharey=True, sharex=True)
     for axes, cells in zip(both, ("isotropic", "random"), strict=True):
-        for name, scheme in SCHEMES.items():
+        for marker, (name, scheme) in zip("os^D", SCHEMES.items(), strict=True):
             rows = (table["cells"] == cells) & (table["scheme"] == name)
-            if rows.any():
-                error = np.maximum(table["error_A"][rows], 1e-12)
-                style = {"color": scheme.colour, "label": scheme.label}
-                axes.loglog(table["seconds"][rows], error, "o", ms=3, lw=1.2, **style)
-        axes.set_xlabel("processor time (s)")
-        axes.set_title(f"{cells} cells")
+            axes.loglog(
+                table["seconds"][rows],
+                table["error_A"][rows],
+                marker,
+                ms=4,
+                color=scheme.colour,
+                label=scheme.label,
+            )
+        axes.set(xlabel="CPU time, s", title=f"{cells} cells", xticks=(0.1, 0.2, 0.5))
+        axes.xaxis.set_major_formatter("{x:g}")
     both[0].set_ylabel("error of $A$ at $t$ = 40")
-    both[0].legend(loc="center left", fontsize=7)
-    figure.subplots_adjust(left=0.1, right=0.98, bottom=0.15, top=0.9, wspace=0.12)
+    both[0].legend(loc="lower left", fontsize=7)
     panel_letters(*both)
     return figure
 
@@ -169,7 +169,7 @@ def rows_of(table: Columns) -> Iterator[list[str]]:
             if rows.any():
                 at_one = rows & (table["step"] == 1.25)
                 A, u, spent = (
-                    float(table[key][at_one].item()) for key in ("error_A", "error_u", "seconds")
+                    table[key][at_one].item() for key in ("error_A", "error_u", "seconds")
                 )
                 orders = (order(table, cells, name, key) for key in ("error_A", "error_u"))
                 yield [scheme.label, cells, f"{A:.1e}", f"{u:.1e}", *orders, f"{spent:.1f}"]
@@ -189,13 +189,11 @@ def main() -> None:
     )
     parser.add_argument("--page", action="store_true", help="measure nothing")
     options = parser.parse_args()
-    source = "benchmarks/couplings.py"
+    source, of_page = "benchmarks/couplings.py", Page(FIGURES, "couplings", *CAPTION)
     if not options.page:
-        Page(FIGURES, "couplings", *CAPTION).save_table(by_column(errors()), [source])
+        of_page.save_table(by_column(errors()), [source])
     with matplotlib.rc_context(STYLE):
-        Page(FIGURES, "couplings", *CAPTION).save_figure(
-            draw(read_table(FIGURES / "couplings.csv")), source
-        )
+        of_page.save_figure(draw(read_table(FIGURES / "couplings.csv")), source)
     PAGE.write_text(page(), encoding="utf-8")
 
 

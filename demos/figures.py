@@ -184,7 +184,7 @@ class Page:
         self.made_with = "eq. (2), wormlike chain; no simulation" if run is None else made_with(run)
         self.notes: dict[str, list[str]] = {}
 
-    def save(self, figure: Figure) -> None:
+    def save(self, figure: Figure, colours: int = 256) -> None:
         """Write the picture; title, caption and versions stand in its file."""
         about = {"Title": self.title, "Description": self.caption}
         about["Source"] = f"{self.made_with}; matplotlib {matplotlib.__version__}"
@@ -195,7 +195,7 @@ class Page:
         self.folder.mkdir(parents=True, exist_ok=True)
         with Image.open(whole) as picture:  # 256 colours are enough, and a third of the bytes
             small = picture.convert("RGB").quantize(
-                256, Image.Quantize.MAXCOVERAGE, 2, dither=Image.Dither.NONE
+                colours, Image.Quantize.MAXCOVERAGE, 2, dither=Image.Dither.NONE
             )
         small.save(
             self.folder / f"{self.name}.png",
@@ -506,7 +506,7 @@ def draw_tendon(runs: Runs, page: Page) -> None:
     figure = Figure(figsize=(8.2, 4.3))
     panels = [figure.add_axes((0.065, 0.115, 0.36, 0.825))]
     axes = panels[0]
-    band = {"color": "0.88", "lw": 0, "label": "elements, least to most"}
+    band = {"color": "0.88", "lw": 0, "label": "elements, minimum to maximum"}
     axes.fill_between(rows["time"], rows["min_stretch"], rows["max_stretch"], **band)
     axes.plot(rows["time"], rows["mean_stretch"], color=COLOURS[0], label="mean")
     marks = [run.value("mean_stretch", time) for time in TENDON_TIMES]
@@ -580,7 +580,7 @@ def draw_artery(runs: Runs, page: Page) -> None:
         axes.set_title(f"$t$ = {time:g}")
     angle_scale(figure, (0.25, 0.075, 0.5, 0.016), IN_WALL.format(""))
     lettered(panels)
-    page.save(figure)
+    page.save(figure, colours=64)  # two thirds of the bytes
     names = (
         "pressure",
         "axial_elongation",
@@ -783,12 +783,12 @@ def draw_energy(runs: Runs, page: Page) -> None:
 
 # ---------------------------------------------------------------- which figures there are
 
-CHAINS_DRAWN = "Black: the four chains of each element's mean cell, deformed and projected on its face, cut off before its edge."
+CHAINS_DRAWN = "Black: the four chains of each element's mean cell, deformed and projected on its face."
 PEELED = "the outer layers of elements cut shorter than the inner ones"
 WALL = "coloured by the deformed angle of the chains in the wall"
 PROFILE = "Reference fibre angle over the radius at t = 150; lines: means of the element layers, bands: all elements"
 RELAXED = (
-    "The printed pass over-corrects with {}: here it is relaxed by one half, in the material frame "
+    "The printed pass overshoots with {}: here it is relaxed by one half, in the material frame "
     "(docs/solver.md, Stability of the pass)."
 )
 
@@ -824,7 +824,7 @@ FIGURES = {
     ),
     "fig7": Spec(
         "Artery under axial elongation and inner pressure (Fig. 7)",
-        f"(a) to (e) The wall at five times, {WALL}; below, the loads. {CHAINS_DRAWN}",
+        f"(a) to (e) The wall at five times, {WALL}; below it, its rear half and the loads. {CHAINS_DRAWN}",
         ("artery",),
         draw_artery,
     ),

@@ -54,7 +54,7 @@ ANGLES = ("fibre_angle", ANGLE)  # fields in degrees, from 0 to 90
 OF_TUBES = ("deformation_gradient", "cell_dimensions", *AXIS_FIELDS)
 SHOWN_FIELDS = ("displacement", ANGLE, *OF_TUBES, *STRESS_FIELDS)
 NAN_COLOUR = "#999ea6"  # colour of points without a fibre angle
-LIFT = 0.03  # distance of chains above a face, which may be curved, over the width of the face
+LIFT = 0.015  # distance of chains above a face, which may be curved, over the width of the face
 LIGHT: dict[str, Any] = {"ambient": AMBIENT, "diffuse": 1 - AMBIENT, "specular": 0.0}
 
 
@@ -75,8 +75,8 @@ def grid(
     body = pyvista.UnstructuredGrid({kind: whole.elements}, whole.points)
     if displacement is not None:
         body.point_data["displacement"] = displacement
-    cells: dict[str, NDArray[Any]] = {"layer": whole.layer, **fields}
-    body.cell_data.update(cells)
+    body.cell_data["layer"] = whole.layer
+    body.cell_data.update({**fields})
     return body if shown is None else body.extract_cells(shown)
 
 
@@ -107,7 +107,7 @@ def add_body(
     looks: dict[str, Any] = {"scalars": name, "show_edges": True, "edge_color": "#777777", **LIGHT}
     if name in ANGLES:
         looks |= {"cmap": list(ANGLE_COLOURS), "clim": (0, 90), "nan_color": NAN_COLOUR}
-    actor = plotter.add_mesh(body, **{**looks, **options})
+    actor = plotter.add_mesh(body, **(looks | options))
     if with_chains and set(OF_TUBES) <= set(body.cell_data):
         plotter.add_mesh(chains(body), color=CHAIN_LOOK["colour"], **LIGHT)
     return actor
@@ -119,10 +119,13 @@ def chains(body: pyvista.UnstructuredGrid) -> pyvista.PolyData:
 
     surface = body.extract_surface().compute_normals(point_normals=False, split_vertices=False)
     faces = surface.faces.reshape(surface.n_cells, -1)[:, 1:]
-    corners = np.asarray(surface.points, dtype=float)[faces]
+    corners = surface.points[faces]
     middle = corners.mean(axis=1)
-    moved = surface.point_data.get("displacement", np.zeros((surface.n_points, 3)))[faces]
-    size = _width(corners - moved)
+    moved = surface.point_data.get("displacement", np.zeros((surface.n_points, 3)))
+    reference = corners - moved[faces]
+    sides = (reference + np.roll(reference, 1, axis=1)) / 2 - reference.mean(axis=1, keepdims=True)
+    # Twice the undeformed distance from the middle of a face to its closest side.
+    size = 2 * np.linalg.norm(sides, axis=2).min(axis=1)
     axes = np.stack([surface.cell_data[name] for name in AXIS_FIELDS], axis=1)
     lengths = surface.cell_data["cell_dimensions"]
     ends, lines = chain_lines(np.zeros_like(middle), lengths, axes, CHAIN_LOOK["reach"])
@@ -134,21 +137,16 @@ def chains(body: pyvista.UnstructuredGrid) -> pyvista.PolyData:
     drawn = pyvista.PolyData(
         (middle[:, None] + arms).reshape(-1, 3), lines=np.insert(lines, 0, 2, axis=1)
     )
-    return drawn.tube(radius=CHAIN_LOOK["width"] / 2 * float(np.median(size[size > 0])), n_sides=6)
-
-
-def _width(corners: Array) -> Array:
-    """Return the shortest nonzero side of each face (m,) from its corners (m, k, 3)."""
-    sides = np.linalg.norm(corners - np.roll(corners, 1, axis=1), axis=2)
-    return np.where(sides > 0, sides, np.inf).min(axis=1)
+    drawn["radius"] = np.repeat(CHAIN_LOOK["width"] / 2 * size, 8)
+    return drawn.tube(scalars="radius", absolute=True, n_sides=6)
 
 
 # ---------------------------------------------------------------- pictures, by a child process
 
-LETTER, NOTE = 15, 11  # font sizes
-PANEL = 600  # pixels: height of a body with its title
+LETTER, NOTE = 15, 12  # font sizes
+PANEL = 600  # pixels: longer side of a body's panel, with its title
 FOOT = 150  # pixels: height of the footer
-ZOOM = 0.8  # leaves space for the title
+ZOOM = 1.7  # twice the fraction of a panel that a body fills, which leaves space for the title
 
 
 class Job(NamedTuple):
@@ -182,10 +180,10 @@ def render(job: Job) -> list[Pixels]:
             text=True,
         )
         result = file.with_suffix(".npy")
-        if child.returncode != 0 or not result.exists():
-            cause = f"pyvista ended with {child.returncode}: {last_line(child.stderr)}"
+        if child.returncode or not result.exists():
             raise FigureError(
-                f"rendering failed: {cause}; check that xvfb and xauth are installed",
+                f"rendering failed: pyvista ended with {child.returncode}: "
+                f"{last_line(child.stderr)}; check that xvfb and xauth are installed",
                 BAD_ENVIRONMENT,
             )
         return list(np.load(result))
@@ -195,7 +193,7 @@ def main(file: str) -> None:
     """Draw the sheets of a job file and save the pictures next to it."""
     job = pickle.loads(Path(file).read_bytes())
     bounds = np.array([body.bounds for sheet in job.sheets for _, body in sheet]).reshape(-1, 3, 2)
-    extent = np.stack([bounds[..., 0].min(axis=0), bounds[..., 1].max(axis=0)], axis=1).ravel()
+    extent = np.stack([bounds[..., 0].min(axis=0), bounds[..., 1].max(axis=0)], axis=1)
     np.save(f"{file}.npy", [_drawn(job, sheet, extent) for sheet in job.sheets])
 
 
@@ -204,45 +202,44 @@ def _drawn(
 ) -> Pixels:
     """Draw the bodies of a sheet next to each other, at one scale."""
     columns = min(len(sheet), MOST_COLUMNS)
-    rows = math.ceil(len(sheet) / columns)
+    rows = -(-len(sheet) // columns)
+    up = (0, 1, 0) if math.hypot(*job.direction[:2]) < 0.01 * abs(job.direction[2]) else (0, 0, 1)
+    across = np.cross(up, job.direction)
+    axes = np.array([across, np.cross(across, job.direction)])
+    seen = np.abs(axes) @ np.ptp(bounds, axis=1) / np.linalg.norm(axes, axis=1)
+    width, height = (PANEL * np.maximum(seen / seen.max(), 0.6)).astype(int)
     plotter: Any = new_plotter(
         off_screen=True,
-        window_size=[max(800, PANEL * columns), PANEL * rows + FOOT],
+        window_size=[max(800, width * columns), height * rows + FOOT],
         shape=(rows + 1, columns),
-        row_weights=[*[PANEL] * rows, FOOT],
+        row_weights=[*[height] * rows, FOOT],
         groups=[(rows, slice(None))],
         border=False,
     )
-    up = (0, 1, 0) if math.hypot(*job.direction[:2]) < 0.01 * abs(job.direction[2]) else (0, 0, 1)
     for number, (title, body) in enumerate(sheet):
         plotter.subplot(*divmod(number, columns))
         actor = add_body(
             plotter, body, job.field, show_scalar_bar=False, line_width=0.5, clim=job.limits
         )
-        plotter.add_text(title, "upper_edge", LETTER, "black")
+        plotter.add_text(title, "upper_edge", LETTER)
         plotter.enable_parallel_projection()
-        plotter.view_vector(job.direction, up, bounds=bounds)
-        plotter.camera.zoom(ZOOM)
+        plotter.view_vector(job.direction, up, bounds=bounds.ravel())
+        plotter.camera.parallel_scale = seen.max() * height / PANEL / ZOOM
     plotter.subplot(rows, 0)
     plotter.view_vector(job.direction, up)
-    look = {
-        "n_labels": 7,
-        "fmt": "%.0f°" if job.field == ANGLE else "%.3g",
-        "color": "black",
-        "label_font_size": LETTER,
-    }
     plotter.add_scalar_bar(
-        job.scale,
+        "",
         mapper=actor.mapper,
-        width=0.6,
         height=0.45,
         position_x=0.2,
         position_y=0.5,
-        **look,
+        n_labels=7,
+        fmt="%.0f°" if job.field == ANGLE else "%.3g",
+        label_font_size=LETTER,
     )
-    plotter.add_text(job.notes, "lower_edge", NOTE, "black")
-    plotter.add_axes(viewport=(0.84, 0.0, 1.0, 1.0), color="black")
-    image = Image.fromarray(np.asarray(plotter.screenshot(return_img=True, scale=2)))
+    plotter.add_text(f"{job.scale}\n{job.notes}", "lower_edge", NOTE)
+    plotter.add_axes(viewport=(0.84, 0.0, 1.0, 1.0))
+    image = Image.fromarray(plotter.screenshot(scale=2))
     plotter.close()
     return np.asarray(image.reduce(2))  # antialiasing with every VTK
 
@@ -264,12 +261,14 @@ class ViewOptions(NamedTuple):
         if self.view in VIEWS:
             return VIEWS[self.view]
         try:
-            x, y, z = (float(text) for text in self.view.split(","))
+            x, y, z = map(float, self.view.split(","))
         except ValueError:
             x = y = z = math.nan
         if not 0 < math.hypot(x, y, z) < math.inf:
-            allowed = f"{', '.join(VIEWS)} or X,Y,Z, the direction from the body to the camera"
-            raise FigureError(f"view {self.view}: must be {allowed}")
+            raise FigureError(
+                f"view {self.view}: must be {', '.join(VIEWS)} or X,Y,Z, "
+                "the direction from the body to the camera"
+            )
         return x, y, z
 
 
@@ -279,8 +278,9 @@ def visible_elements(whole: WholeBody, viewing: ViewOptions) -> NDArray[np.bool_
     if layers is not None and not 1 <= layers <= count:
         shape = whole.recording.scene.geometry
         start = shape.depth_labels[1]
-        rule = f"must be an integer from 1 to {count}, from the {start}"
-        raise FigureError(f"layers {layers}: {rule}")
+        raise FigureError(
+            f"layers {layers}: must be an integer from 1 to {count}, from the {start}"
+        )
     return (whole.layer < (layers or count)) & ~_cut_off(whole, viewing.cut)
 
 
@@ -322,8 +322,9 @@ def draw_picture(
         float(recorded[np.abs(recorded - time).argmin()]) for time in times or recorded[-1:]
     )
     if len(shown) > MOST_PANELS:
-        rule = f"must be at most {MOST_PANELS} (animate shows more)"
-        raise FigureError(f"times: {len(shown)} times; {rule}")
+        raise FigureError(
+            f"times: {len(shown)} times; must be at most {MOST_PANELS} (animate shows more)"
+        )
     return _draw(whole, [[*shown]], viewing, path, ".png")
 
 
@@ -332,13 +333,15 @@ def draw_animation(
 ) -> Path:
     """Draw the body of a run over time."""
     if not FEWEST_FRAMES <= frames <= MOST_FRAMES:
-        rule = f"must be an integer from {FEWEST_FRAMES} to {MOST_FRAMES}"
-        raise FigureError(f"--frames {frames}: {rule}")
+        raise FigureError(
+            f"--frames {frames}: must be an integer from {FEWEST_FRAMES} to {MOST_FRAMES}"
+        )
     whole = _body_for(folder, path, (".gif", ".webp"))
     recorded = whole.recording.times
     if len(recorded) == 1:
-        fault = "fields are recorded at one time only; an animation needs two"
-        raise FigureError(f"{whole.recording.path}: {fault}")
+        raise FigureError(
+            f"{whole.recording.path}: fields are recorded at one time only; an animation needs two"
+        )
     return _draw(
         whole, [[float(time)] for time in kept_times(recorded, frames)], viewing, path, ".gif"
     )
@@ -380,31 +383,30 @@ def _draw(
         values = [body.cell_data[field] for sheet in drawn for _, body in sheet]
         label, limits = words(field), [np.min(values), np.max(values)]
         scale = f"{label}, means of elements {unit_of(scene, 'stress')}"
-    notes = f"{scene.name}: {len(whole.elements):,} elements. "
-    notes += " ".join(whole.notes("displacement" in drawn[0][0][1].point_data))
-    look = viewing.direction, field, limits, scale, textwrap.fill(notes, 110)
-    images = render(Job(drawn, *look))
-    first, *others = map(Image.fromarray, images)
+    notes = f"{scene.name}: {len(whole.elements):,} elements. " + " ".join(
+        whole.notes("displacement" in drawn[0][0][1].point_data)
+    )
+    job = Job(drawn, viewing.direction, field, limits, scale, textwrap.fill(notes, 110))
+    first, *others = map(Image.fromarray, render(job))
     texts, title = PngInfo(), f"{scene.name}: {label}"
-    source = "; ".join(f"{name} {version}" for name, version in recording.versions.items())
-    about = {
-        "Title": title,
-        "Description": notes,
-        "Software": f"remodel_fenicsx {__version__}",
-        "Source": source,
-    }
-    for key, value in about.items():
-        texts.add_text(key, value)
-    durations = [FRAME_TIME] * len(others) + [LAST_TIME]
-    moving: dict[str, Any] = {
+    texts.add_text("Title", title)
+    texts.add_text("Description", notes)
+    texts.add_text("Software", f"remodel_fenicsx {__version__}")
+    texts.add_text("Source", "; ".join(map(" ".join, recording.versions.items())))
+    moving = {
         "save_all": True,
         "append_images": others,
         "loop": 0,
-        "duration": durations,
+        "duration": [FRAME_TIME] * len(others) + [LAST_TIME],
     }
     file = io.BytesIO()
-    kind = (path.suffix.lower() if path else ending)[1:]
-    first.save(file, kind, pnginfo=texts, title=title, **(moving if others else {}))
+    first.save(
+        file,
+        (path.suffix.lower() if path else ending)[1:],
+        pnginfo=texts,
+        title=title,
+        **(moving if others else {}),
+    )
     stem = "-".join(
         [scene.name, *dict.fromkeys(f"t{times[0]:g}" for times in (sheets[0], sheets[-1][-1:]))]
     )

@@ -181,8 +181,9 @@ class Recording(RecordedRun):
         shown = pictures.visible_elements(whole, pictures.ViewOptions(layers, cut))
         if elements is not None:
             if np.shape(elements) != shown.shape:
-                rule = f"must be a mask of all {len(shown)}"
-                raise pictures.FigureError(f"elements of shape {np.shape(elements)}: {rule}")
+                raise pictures.FigureError(
+                    f"elements of shape {np.shape(elements)}: must be a mask of all {len(shown)}"
+                )
             shown &= np.asarray(elements, dtype=bool)
         body = pictures.grid(whole, self._time(time), shown)
         if name not in body.cell_data:

@@ -147,7 +147,7 @@ def body_image(
     )
     plotter.enable_parallel_projection()
     plotter.view_vector(demo.eye, (0, 0, 1), bounds=bounds)
-    plotter.camera.zoom(1.05)
+    plotter.camera.zoom(1.05 if bounds is None else 1.2)
     image = Image.fromarray(np.asarray(plotter.screenshot(return_img=True)))
     plotter.close()
     return np.asarray(image.reduce(2))
@@ -176,7 +176,7 @@ def of_fit(axes: Axes, name: str, demo: Fit) -> None:
     _, found = fit(read_scene(scene), data, WORK / name, starts=1, profiles=False)
     for table, model in zip(found.problem.tables, found.modelled, strict=True):
         unit_of = {column: unit for column, (_, unit) in table.units.items()}
-        for rows in table.protocols:
+        for rows in table.protocols.values():
             over = table.over(demo.column)
             x = table.columns[over][rows] / unit_of.get(over, 1.0)
             scale = unit_of.get(demo.column, 1.0)

@@ -108,19 +108,25 @@ def rows_of(path: Path) -> list[dict[str, Any]]:
 def drawn(
     page: Page, draw: Callable[..., Figure], *tables: Any, made: str = "", **style: Any
 ) -> None:
-    """Save what a function draws of tables; 256 colours are enough, and a third of the bytes."""
+    """Save what a function draws of tables."""
     with rc_context(STYLE | style):
         page.save_figure(draw(*tables), made or made_with())
     path = page.folder / f"{page.name}.png"
-    with Image.open(path) as picture:
+    save_small(path, path)
+
+
+def save_small(source: Path, path: Path) -> None:
+    """Copy a picture; 256 colours are enough, and a third of the bytes."""
+    with Image.open(source) as picture:
         about = PngInfo()
         for key, value in picture.info.items():
             if isinstance(value, str):
                 about.add_text(key, value)
+        dots = picture.info.get("dpi", (DOTS_PER_INCH, DOTS_PER_INCH))
         small = picture.convert("RGB").quantize(
             256, Image.Quantize.MAXCOVERAGE, 2, dither=Image.Dither.NONE
         )
-    small.save(path, pnginfo=about, optimize=True, dpi=(DOTS_PER_INCH, DOTS_PER_INCH))
+    small.save(path, pnginfo=about, optimize=True, dpi=dots)
 
 
 def panel_letters(*axes_of_panels: Axes) -> None:

@@ -13,7 +13,7 @@ from docs.making.pages import FIGURES, drawn
 from remodel_fenicsx.results.recording import ANGLE_COLOURS
 from remodel_fenicsx.studies.study import COLOURS, Page
 
-DEPTH = np.array([0.37, 0.33])  # where a unit of the third axis goes on the paper
+DEPTH = np.array([0.46, 0.2])  # where a unit of the third axis goes on the paper
 BLUE, RED = COLOURS[:2]
 TURN = np.radians(-14.0)  # of the principal stresses of the cell
 TISSUE = "#e6e0d6"
@@ -73,36 +73,40 @@ def draw_cell(axes: Axes, dimensions: Sequence[float], turn: float, slack: float
 def draw_axes_of_cell(axes: Axes, dimensions: Sequence[float], turn: float, reach: float) -> None:
     """Draw n_I as thin arrows from the faces of a cell."""
     for number, (size, along) in enumerate(zip(dimensions, directions(turn), strict=True), start=1):
-        start, end = size * along, (size + reach) * along
+        ahead = along / np.linalg.norm(along)
+        start, end = size * along, size * along + reach * ahead
         arrow(axes, start, end, color="0.25", lw=0.9)
-        axes.annotate(f"$n_{number}$", end + 0.08 * along / np.linalg.norm(along), ha="center",
-                      va="center", color="0.25")  # fmt: skip
+        axes.annotate(f"$n_{number}$", end + 0.12 * ahead, ha="center", va="center", color="0.25")
 
 
 def draw_stresses(axes: Axes, dimensions: Sequence[float], labels: Sequence[str]) -> None:
     """Draw the principal stresses on the faces: two tensions, and a compression along the depth."""
-    for size, along, length, label in zip(dimensions, directions(TURN), (0.55, 0.3, -0.62), labels, strict=True):  # fmt: skip
+    lengths = 0.5, 0.3, -1.55
+    for number, size, along, length, label in zip((1, 2, 3), dimensions, directions(TURN), lengths, labels, strict=True):  # fmt: skip
         for side in (-1, 1):
             near, far = side * (size + 0.06) * along, side * (size + 0.06 + abs(length)) * along
             arrow(axes, *((near, far) if length > 0 else (far, near)), color=RED, lw=2.2)
-        place, beside = -(size + 0.06 + abs(length)) * along, -9 if length > 0 else -4
-        axes.annotate(label, place, (beside, -9), textcoords="offset points", ha="center",
+        place, is_tension = -(size + 0.06 + abs(length)) * along, length > 0
+        axes.annotate(label, place, (-9 if is_tension else -3, -9 if is_tension else -7),
+                      textcoords="offset points", ha="center" if is_tension else "right",
                       va="center", color=RED)  # fmt: skip
+        end = -place + (0.12 if is_tension else 0.2) * along / np.linalg.norm(along)
+        axes.text(*end, f"$n_{number}$", ha="center", va="center", color="0.25")
 
 
 def cell() -> Figure:
     """Draw the cell before, at and after remodeling."""
-    figure = Figure(figsize=(7.4, 2.9), layout="constrained")
+    figure = Figure(figsize=(7.4, 2.5), layout="constrained")
     panels = figure.subplots(1, 3)
     equal, later = (3**-0.5,) * 3, (0.88, 0.46, 0.06)
     blank(panels[0], "a", "before any load:\nisotropic cell, $l_1 = l_2 = l_3$")
     draw_cell(panels[0], equal, 0.0, 0.05)
-    draw_axes_of_cell(panels[0], equal, 0.0, 0.3)
+    draw_axes_of_cell(panels[0], equal, 0.0, 0.42)
     bottom = corners(equal, 0.0)[:, 1].min() - 0.09
     left = corners(equal, 0.0)[0, 0]
     arrow(panels[0], (left, bottom), (left + equal[0], bottom), arrowstyle="<|-|>", lw=0.8)
-    panels[0].text(left + equal[0] / 2, bottom - 0.05, "$l_1$", ha="center", va="top")
-    panels[0].text(-1.0, -1.27, "chain: end-to-end length $r$,\nlocks at $r = L$", color=BLUE, fontsize=7.5)  # fmt: skip
+    panels[0].text(left + equal[0] / 2, bottom - 0.03, "$l_1$", ha="center", va="top")
+    panels[0].text(-1.0, -1.4, "chain: end-to-end length $r$,\nlocks at $r = L$", color=BLUE, fontsize=7.5)  # fmt: skip
     blank(panels[1], "b", "under load: the axes $n_I$ take\nthe principal directions of stress")
     draw_cell(panels[1], equal, TURN, 0.04)
     draw_stresses(panels[1], equal, ("$\\sigma_1$", "$\\sigma_2$", "$\\sigma_3 < 0$"))
@@ -121,9 +125,9 @@ def cell() -> Figure:
         *(np.linspace(0, 0.88, 2)[:, None] * directions(TURN)[0]).T, ":", color="black", lw=1
     )
     panels[2].text(*(0.68 * np.array([np.cos(TURN + 0.23), np.sin(TURN + 0.23)])), "$\\alpha$", ha="center", va="center")  # fmt: skip
-    panels[2].text(-1.3, -1.28, "$\\tan\\alpha = l_2 / l_1$", fontsize=8)
+    panels[2].text(-1.3, -1.36, "$\\tan\\alpha = l_2 / l_1$", fontsize=8)
     for axes in panels:
-        axes.set(xlim=(-1.35, 1.35), ylim=(-1.3, 1.25))
+        axes.set(xlim=(-1.6, 1.6), ylim=(-1.4, 1.15))
     return figure
 
 

@@ -10,13 +10,14 @@ from __future__ import annotations
 import os
 import re
 import shlex
-import shutil
 import subprocess
 import sys
 import tempfile
 import time
 from collections.abc import Iterator
 from pathlib import Path
+
+from docs.making.pages import save_small
 
 DOCS = Path(__file__).resolve().parents[1]
 BLOCK = re.compile(r"^```(\w+)\n(.*?)^```", re.MULTILINE | re.DOTALL)
@@ -107,4 +108,4 @@ def make(keep: bool) -> None:
             text = path.read_text(encoding="utf-8")
             path.write_text(brought_up_to_date(text), encoding="utf-8")
             for name in re.findall(r"figures/(tutorial-[\w-]+\.png)", text):
-                shutil.copy(PICTURES[name], DOCS / "figures" / name)
+                save_small(Path(PICTURES[name]), DOCS / "figures" / name)

@@ -507,11 +507,12 @@ def draw(found: Columns) -> Figure:
         places = np.arange(len(BANDS)) + 0.12 * (number - 1.5)
         face = COLOURS[number // 2] if number % 2 else "white"
         angles = [found[name][number] for name in BANDS]
-        axes.plot(places, angles, "os^D"[number], mec=COLOURS[number // 2], mfc=face, label=label)
+        text = f"model, radii {label}" + ("°" if number % 2 else "")
+        axes.plot(places, angles, "os^D"[number], mec=COLOURS[number // 2], mfc=face, label=text)
     axes.set(ylabel="fibre angle to the circumference, degrees", ylim=(-2, 90), xlim=(-0.5, 2.5))
     axes.set_xticks(range(len(BANDS)), ["inner eighth", "mid-wall", "outer eighth"])
     axes.grid(axis="x", visible=False)
-    axes.legend(fontsize=7, loc="upper left", title="radii of the wall", alignment="left")
+    axes.legend(fontsize=7, loc="upper left")
     return figure
 
 

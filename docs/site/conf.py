@@ -21,6 +21,7 @@ default_role = (
     "py:obj"  # what docstrings have in backticks: a link where it is a public name, else code
 )
 autodoc_typehints = "none"
+autodoc_preserve_defaults = True  # as the source says, without paths of this machine
 autodoc_member_order = "bysource"
 toc_object_entries_show_parents = "hide"  # else they are wider than their column
 suppress_warnings = ["misc.highlighting_failure"]  # shells' prompts and shortened TOML in examples
@@ -28,6 +29,7 @@ html_theme = "pydata_sphinx_theme"
 html_title = "remodel_fenicsx"
 html_search_scorer = str(Path(__file__).with_name("scorer.js"))
 html_copy_source = html_show_sourcelink = False
+html_context = {"default_mode": "auto"}  # dark and light as the reader's system
 html_theme_options = {
     "show_toc_level": 2,
     "header_links_before_dropdown": 6,
@@ -52,6 +54,13 @@ def link(app: Any, what: str, name: str, value: Any, options: Any, lines: list[s
     lines[:] = [re.sub(r"docs/(\w+)\.md", r":doc:`\1`", line) for line in lines]
 
 
+def without_paths(app: Any, *about: Any) -> tuple[str | None, str | None]:
+    """A signature in which modules and objects that are defaults have their names, no path and no address."""
+    *_, signature, returns = about
+    name = r"<(?:module '|function )?[\w.]*?(\w+)(?:' from '[^']*'| object)?(?: at 0x\w+)?>"
+    return re.sub(name, r"\1", signature or "") or None, returns
+
+
 def setup(app: Any) -> None:
     """Tables in pages: Pygments knows no CSV. Attributes of classes: under the name that they have in docstrings."""
     app.add_lexer("csv", TextLexer)
@@ -59,3 +68,4 @@ def setup(app: Any) -> None:
         if field.name == "variable":
             field.label = "Attributes"
     app.connect("autodoc-process-docstring", link)
+    app.connect("autodoc-process-signature", without_paths)

@@ -69,6 +69,10 @@ def test_the_site_needs_no_network(site: Path) -> None:
             assert (site / link.partition("?")[0]).exists(), (page.name, link)
 
 
+def test_each_tutorial_is_a_notebook_too(site: Path) -> None:
+    assert len([*site.glob("_downloads/*/tutorial_*.ipynb")]) == 7
+
+
 def test_every_public_name_has_its_place(site: Path) -> None:
     """Registries too, and what a class inherits from a private base; nothing that is private."""
     import remodel_fenicsx
