@@ -11,7 +11,6 @@ from typing import TYPE_CHECKING
 
 import dolfinx.fem
 import numpy as np
-from numpy.typing import NDArray
 
 from remodel_fenicsx._renamed import with_old_names
 from remodel_fenicsx.body.domain import Domain, dof_of_node
@@ -32,12 +31,12 @@ from remodel_fenicsx.model.energy import (
     Tissue,
     mixture_matrix,
 )
+from remodel_fenicsx.model.tensors import Array, Flags, Integers
 from remodel_fenicsx.schema.settings import Cells, MEASURED_CELLS, Properties
 
 if TYPE_CHECKING:
     from mpi4py import MPI
 
-Array = NDArray[np.float64]
 
 # ---------------------------------------------------------------- unit cells at quadrature points
 
@@ -175,7 +174,7 @@ class UnitCells(CellField):
         self.initial_dimensions: Array = self.dimension_values.copy()
 
     def _take(
-        self, measured: Mapping[str, Array], chosen: NDArray[np.bool_], axes: Array, length: float
+        self, measured: Mapping[str, Array], chosen: Flags, axes: Array, length: float
     ) -> None:
         """Set cells of chosen elements from measured fibres; `axes` replace undetermined axes."""
         at_points = {name: values[:, None, :] for name, values in measured.items()}
@@ -311,7 +310,7 @@ class State:
         loading.set(dict.fromkeys(loading.values, 0.0))
 
     @cached_property
-    def _dof_of_node(self) -> NDArray[np.int64]:
+    def _dof_of_node(self) -> Integers:
         return dof_of_node(self.loading.domain.mesh, self.kinematics.nodal_space(self.unknown))
 
     def gathered_displacement(self) -> Array | None:
@@ -703,7 +702,7 @@ class Parameters:
             return np.full(self.quadrature.shape, np.inf)
         return np.where(self.has_chains(), length.reshape(self.quadrature.shape), np.inf)
 
-    def has_chains(self) -> NDArray[np.bool_]:
+    def has_chains(self) -> Flags:
         """Return whether points have chains, (elements, points)."""
         return np.asarray(self.at_points().network_modulus > 0.0).reshape(self.quadrature.shape)
 

@@ -7,7 +7,6 @@ from dataclasses import replace
 from typing import TYPE_CHECKING
 
 import numpy as np
-from numpy.typing import NDArray
 
 from remodel_fenicsx.evolution.life_cycle import Remodels
 from remodel_fenicsx.evolution.stepper import Step, Stepper, WarnsOnce
@@ -15,6 +14,7 @@ from remodel_fenicsx.fem.kinematics import NaturalConfiguration
 from remodel_fenicsx.model.axes import GROWTH
 from remodel_fenicsx.model.energy import TURNED_OVER, Tissue
 from remodel_fenicsx.model.laws import TurnoverRates
+from remodel_fenicsx.model.tensors import Array
 from remodel_fenicsx.schema.processes.turnover import Turnover
 from remodel_fenicsx.schema.settings import Remodeling
 from remodel_fenicsx.solver.continuation import StepFailure, Work
@@ -24,7 +24,6 @@ from remodel_fenicsx.state import FieldHistory, StateNumbers, State
 if TYPE_CHECKING:
     from remodel_fenicsx.scene.scene import Scene
 
-Array = NDArray[np.float64]
 
 # Smallest volume, relative to the initial one. With less the tissue is lost, and the step fails.
 LEAST_VOLUME = 0.05

@@ -26,13 +26,13 @@ import ffcx.codegeneration.jit
 import ffcx.options
 import numpy as np
 from mpi4py import MPI
-from numpy.typing import NDArray
 from ufl import as_vector
 from ufl.classes import Label
 from ufl.corealg.map_dag import map_expr_dag
 from ufl.corealg.multifunction import MultiFunction
 from ufl.domain import extract_unique_domain
 
+from remodel_fenicsx.model.tensors import Array
 from remodel_fenicsx.system.interrupts import held_back, raise_on_signal
 from remodel_fenicsx.system import NOTICE
 
@@ -168,7 +168,7 @@ def form(ufl_form: Form, name: str | None = None) -> dolfinx.fem.Form:
 
 def expression(
     ufl_expression: Expr,
-    points: NDArray[np.float64],
+    points: Array,
     name: str | None = None,
 ) -> list[dolfinx.fem.Expression]:
     """Compile a UFL expression for evaluation at reference points, (n, 3). See `form`.

@@ -10,10 +10,10 @@ from collections.abc import Mapping
 from typing import Any, ClassVar, TYPE_CHECKING
 
 import numpy as np
-from numpy.typing import NDArray
 
 from remodel_fenicsx._renamed import with_old_names
 from remodel_fenicsx._lazy import Late
+from remodel_fenicsx.model.tensors import Array
 
 if TYPE_CHECKING:
     from dolfinx.fem import Constant, Function, FunctionSpace
@@ -22,7 +22,6 @@ if TYPE_CHECKING:
 
 ufl, basix_ufl = Late("ufl"), Late("basix.ufl")
 fem = Late("dolfinx.fem")
-Array = NDArray[np.float64]
 
 
 @with_old_names

@@ -5,14 +5,12 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from remodel_fenicsx._lazy import Late
 from remodel_fenicsx.model.chains import UflOrArray
-from remodel_fenicsx.model.tensors import is_array
+from remodel_fenicsx.model.tensors import is_array, Array
 
 ufl = Late("ufl")
-Array = NDArray[np.float64]
 
 
 class UnitCell(NamedTuple):

@@ -23,10 +23,10 @@ from remodel_fenicsx.fem import compat, jit
 from remodel_fenicsx.fem.assembly import integral, allreduce
 from remodel_fenicsx.fem.quadrature import Quadrature
 from remodel_fenicsx.model.drivers import DRIVERS
+from remodel_fenicsx.model.tensors import Array, Flags
 from remodel_fenicsx.schema.tables import SceneError, format_value
 from remodel_fenicsx.solver.equilibrium import Equilibrium, PointStresses
 
-Array = NDArray[np.float64]
 T = TypeVar("T")
 NO_LUMEN = 1e-9  # of the body's size cubed: a flat inner face encloses that by rounding
 
@@ -260,7 +260,7 @@ class Measurement:
             / length
         )
 
-    def elements_of_region(self, name: str) -> NDArray[np.bool_]:
+    def elements_of_region(self, name: str) -> Flags:
         """Return a mask of the local elements of a region, (elements,)."""
         return np.asarray(self.domain.element_region == self.domain.regions[name])
 
@@ -353,10 +353,10 @@ class Measurement:
         """
         return self.quadrature.minimum(values)
 
-    def elements_touching_radius(self, radius: float) -> NDArray[np.bool_]:
+    def elements_touching_radius(self, radius: float) -> Flags:
         """Return a mask of the local elements at a radius from the z axis, (elements,)."""
 
-        def touch() -> NDArray[np.bool_]:
+        def touch() -> Flags:
             mesh = self.domain.mesh
             nodes = mesh.geometry.x[compat.geometry_dofmap(mesh)]
             radii, tolerance = np.linalg.norm(nodes[..., :2], axis=-1), 1e-6 * self.domain.size

@@ -7,18 +7,16 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import dolfinx.fem
 import numpy as np
-from numpy.typing import NDArray
 
 from remodel_fenicsx.body.shape import Shape
 from remodel_fenicsx.evolution.stepper import Step, Stepper, WarnsOnce
 from remodel_fenicsx.fem.compat import geometry_dofmap
 from remodel_fenicsx.fem.formulations import FORMULATIONS, NOT_LOCKING, STIFF_BULK
+from remodel_fenicsx.model.tensors import Array
 from remodel_fenicsx.system import NOTICE
 
 if TYPE_CHECKING:
     from remodel_fenicsx.scene.scene import Scene
-
-Array = NDArray[np.float64]
 
 
 # ---------------------------------------------------------------- spurious stiffness
