@@ -78,12 +78,8 @@ _KINDS = {
     2: ("the tangent", 3, TANGENT_FLAGS),
 }
 
-_compiled: list[str] = []
-
-
-def compiled_kernels() -> tuple[str, ...]:
-    """Return the names of the kernels that this process has compiled, not those from the cache."""
-    return tuple(_compiled)
+compiled_kernels: list[str] = []
+"""Names of the kernels that this process has compiled, not of those from the cache."""
 
 
 @functools.cache
@@ -285,7 +281,7 @@ def _compiling(kernel: str, what: str, seconds: int) -> Iterator[None]:
         start = clock.monotonic()
         yield
         log.info("compiled %s in %.1f s: %s", what, clock.monotonic() - start, kernel)
-        _compiled.append(kernel)
+        compiled_kernels.append(kernel)
         if os.environ.get(COMPILED_LOG_VARIABLE):
             with open(os.environ[COMPILED_LOG_VARIABLE], "a") as file:
                 file.write(f"{kernel}\n")

@@ -76,7 +76,7 @@ Columns = dict[str, Array]
 
 # ---------------------------------------------------------------- data, checked before any solve
 LARGEST_TABLE = 10**7  # bytes: a hundred thousand rows
-DIMENSIONS = {"stress": STRESS, "length": LENGTH, "stress * length^2": FORCE, "force": FORCE}
+DIMENSIONS = {"stress": STRESS, "length": LENGTH, "force": FORCE}
 PROTOCOL = "protocol"  # the column of labels of protocols
 NOT_MEASURED = set(
     (
@@ -1001,7 +1001,7 @@ def result_of(problem: Problem, ends: Sequence[OptimizeResult]) -> Fit:
     jacobian = problem.jacobian(logarithms, central=True)
     problem.check_identifiable(jacobian)
     misfit = float(np.sqrt(np.mean(problem.residuals(logarithms) ** 2)))
-    covariance = np.asarray(np.linalg.inv(jacobian.T @ jacobian))
+    covariance = np.linalg.inv(jacobian.T @ jacobian)
     minima = [2 * float(end.cost) for end in ends]
     scene, models = problem.scene_of(logarithms), problem.predictions(logarithms)
     return Fit(scene, problem, logarithms, covariance, misfit, minima, models)
@@ -1084,7 +1084,7 @@ class Fit(StudyResult):
     @property
     def correlations(self) -> Array:
         """Correlation matrix of the logarithms, (n, n)."""
-        return np.asarray(self.covariance / np.outer(self.deviations, self.deviations))
+        return self.covariance / np.outer(self.deviations, self.deviations)
 
     @property
     def inflation(self) -> float:
