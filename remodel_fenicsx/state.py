@@ -61,8 +61,8 @@ class CellField:
         self.quadrature = quadrature
         self.dimensions = quadrature.function(f"{name}_dimensions", (3,))
         self.axes = quadrature.function(f"{name}_axes", (3, 3))
-        self.dimension_values: Array = quadrature.values(self.dimensions, (3,))
-        self.axis_values: Array = quadrature.values(self.axes, (3, 3))
+        self.dimension_values = quadrature.values(self.dimensions, (3,))
+        self.axis_values = quadrature.values(self.axes, (3, 3))
         self.point_cells = UnitCell(
             self.dimension_values.reshape(-1, 3), self.axis_values.reshape(-1, 3, 3)
         )
@@ -171,7 +171,7 @@ class UnitCells(CellField):
                 drawn = cells.dimensions(domain.number_of_elements)
                 self.dimension_values[chosen] = drawn[domain.element_number[chosen]][:, None, :]
                 self.axis_values[chosen] = axes[chosen]
-        self.initial_dimensions: Array = self.dimension_values.copy()
+        self.initial_dimensions = self.dimension_values.copy()
 
     def _take(
         self, measured: Mapping[str, Array], chosen: Flags, axes: Array, length: float
@@ -704,7 +704,7 @@ class Parameters:
 
     def has_chains(self) -> Flags:
         """Return whether points have chains, (elements, points)."""
-        return np.asarray(self.at_points().network_modulus > 0.0).reshape(self.quadrature.shape)
+        return (self.at_points().network_modulus > 0.0).reshape(self.quadrature.shape)
 
     def nan_without_chains(self, values: Array) -> Array:
         """Return values (elements, points) with NaN at points without chains."""

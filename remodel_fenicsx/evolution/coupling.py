@@ -83,7 +83,7 @@ class Predictor:
         speed = speeds[0]
         if len(speeds) == SUMMED + FITTED:
             speed = self._weights(speeds) @ np.array(speeds[:SUMMED])
-        values: Array = state.unknown.x.array + step.duration * speed
+        values = state.unknown.x.array + step.duration * speed
         for condition in state.loading.boundary_conditions:
             condition.set(values)
         return values

@@ -258,7 +258,7 @@ class RemodelingPass(Remodels):
         """Return flags (n,) of points with no or hardly any tension."""
         drive = self.drive(residual)
         if self.law.target is not None:
-            return np.asarray(self.target(residual).switch < MIN_ACTIVATION)
+            return self.target(residual).switch < MIN_ACTIVATION
         values = np.linalg.eigvalsh(drive.tensor)
         return ~spectral.positive_direction(values, threshold=drive.noise)[1]
 
@@ -379,4 +379,4 @@ class RemodelingPass(Remodels):
         """Return the change of A by a pass up to a time, (elements, points, 3, 3)."""
         remodeled, _ = self.updated_cells(self.state.time, time, residual)
         present = self.state.cells.structure_tensor()
-        return np.asarray(structure_tensor(*remodeled[:2]).reshape(present.shape) - present)
+        return structure_tensor(*remodeled[:2]).reshape(present.shape) - present

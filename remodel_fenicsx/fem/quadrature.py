@@ -116,8 +116,8 @@ class Quadrature:
         self.element_kind = mesh.topology.cell_name()
         self.degree = DEGREES[self.element_kind, element_degree]
         points, weights = basix.make_quadrature(basix.CellType[self.element_kind], self.degree)
-        self.points: Array = np.asarray(points, dtype=np.float64)
-        self.weights: Array = np.asarray(weights, dtype=np.float64)
+        self.points = np.asarray(points, dtype=np.float64)
+        self.weights = np.asarray(weights, dtype=np.float64)
         dimension = mesh.topology.dim
         elements = mesh.topology.index_map(dimension)
         self.number_of_owned_elements = elements.size_local
@@ -134,7 +134,7 @@ class Quadrature:
                 jit.expression(weight, self.points, "the volume of the body per unit of mesh"), ()
             )
         self.volumes = self.volumes * weight
-        self.smallest_lengths: Array = np.asarray(lengths[..., -1], dtype=np.float64)
+        self.smallest_lengths = np.asarray(lengths[..., -1], dtype=np.float64)
         self.largest_areas: Array = (self.volumes / lengths[..., -1]).sum(axis=1)
         self.smallest_areas: Array = (self.volumes / lengths[..., 0]).sum(axis=1)
 
@@ -272,7 +272,7 @@ class Quadrature:
             shape_functions(self.element_kind, degree, x)[0] for x in (self.points, points)
         )
         roots = np.sqrt(self.weights)[:, None]
-        return np.asarray(elsewhere @ (np.linalg.pinv(roots * polynomials) * roots.T))
+        return elsewhere @ (np.linalg.pinv(roots * polynomials) * roots.T)
 
     def superconvergent(self, values: Array) -> Array:
         """Return values (elements, points, n) at superconvergent points.
@@ -285,7 +285,7 @@ class Quadrature:
 
     def superconvergent_from_nodes(self, values: Array) -> Array:
         """Interpolate nodal values (elements, nodes) to the superconvergent points."""
-        return np.asarray(values @ self._node_functions(self._superconvergent_points).T)
+        return values @ self._node_functions(self._superconvergent_points).T
 
     def _node_functions(self, points: Array) -> Array:
         """Return the geometry's shape functions at points of an element, (points, nodes)."""
@@ -323,7 +323,7 @@ class Quadrature:
         np.add.at(at_nodes, nodes, np.concatenate([values * volumes, volumes], axis=-1))
         sums.scatter_reverse(dolfinx.la.InsertMode.add)
         sums.scatter_forward()
-        return np.asarray(at_nodes[nodes, :-1] / at_nodes[nodes, -1:])
+        return at_nodes[nodes, :-1] / at_nodes[nodes, -1:]
 
     def maximum(self, values: Array) -> float:
         """Return the largest of values (elements, ...) over all ranks. Collective."""
@@ -333,7 +333,7 @@ class Quadrature:
     def argmax_position(self, values: Array) -> tuple[float, float, float]:
         """Return the reference position of the largest of values (elements, points). Collective."""
         owned = self.owned(values)
-        local: tuple[float, tuple[float, float, float]] = (-np.inf, (np.nan, np.nan, np.nan))
+        local = (-np.inf, (np.nan, np.nan, np.nan))
         if owned.size:
             at = np.unravel_index(int(np.argmax(owned)), owned.shape)
             local = (float(owned[at]), tuple(self.coordinates[at].tolist()))

@@ -144,7 +144,7 @@ class PointKernels:
 
     def squared_length(self, F: Array, cell: UnitCell) -> Array:
         """Return `energy.squared_end_to_end_length` of one whole cell, (n,)."""
-        return np.asarray(energy.squared_end_to_end_length(F, [cell]))
+        return energy.squared_end_to_end_length(F, [cell])
 
 
 class CompiledPointKernels(PointKernels):

@@ -200,7 +200,7 @@ def _volumes(corners: Array) -> Array:
         grid = corners[:, [0, 1, 3, 2, 4, 5, 7, 6]].reshape(-1, 2, 2, 2, 3)
         sides = np.stack([np.diff(grid, axis=k).mean(axis=(1, 2, 3)) for k in (1, 2, 3)], axis=1)
     total = np.abs(np.linalg.det(sides))
-    return np.asarray(total / total.sum())
+    return total / total.sum()
 
 
 def _layers(depth: Array, elements: Integers) -> tuple[Integers, Array]:

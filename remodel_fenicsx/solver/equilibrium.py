@@ -302,7 +302,7 @@ class Equilibrium:
         F, cells = self.state.elastic_gradient(), self.state.cells
         if self._point_shares is None:
             return cells.kernels.squared_length(F, cells.point_cells).reshape(shape)
-        return np.asarray(squared_end_to_end_length(F, self._point_shares())).reshape(shape)
+        return squared_end_to_end_length(F, self._point_shares()).reshape(shape)
 
     def stored_energy(self) -> float:
         """Return the integral of W over the body. Collective."""

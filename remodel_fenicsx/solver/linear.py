@@ -464,7 +464,7 @@ def cheaper_method(equilibrium: Equilibrium) -> str:
         size / 1e9,
         memory / 1e9,
     )
-    return str(allreduce(equilibrium.comm, method, MPI.MAX))
+    return allreduce(equilibrium.comm, method, MPI.MAX)
 
 
 class Lagged(FullNewton):

@@ -155,7 +155,7 @@ class LockingWarning(ElementWarning):
         shear = (self.stiffnesses[1] * weights).sum(axis=1) / weights.sum(axis=1)
         inside = (shape * weights).sum(axis=1) / weights.sum(axis=1)
         jumps = JUMPS * 2 * shear * quadrature.jumps(F)
-        return np.asarray(np.minimum(1.0, jumps / np.maximum(inside, np.finfo(float).tiny)))
+        return np.minimum(1.0, jumps / np.maximum(inside, np.finfo(float).tiny))
 
     def work(self) -> tuple[float, float]:
         """Return the linearised work of loads and supports, and of loads alone. Collective."""
