@@ -1001,7 +1001,7 @@ def result_of(problem: Problem, ends: Sequence[OptimizeResult]) -> Fit:
     jacobian = problem.jacobian(logarithms, central=True)
     problem.check_identifiable(jacobian)
     misfit = float(np.sqrt(np.mean(problem.residuals(logarithms) ** 2)))
-    covariance = np.linalg.inv(jacobian.T @ jacobian)
+    covariance = np.asarray(np.linalg.inv(jacobian.T @ jacobian))
     minima = [2 * float(end.cost) for end in ends]
     scene, models = problem.scene_of(logarithms), problem.predictions(logarithms)
     return Fit(scene, problem, logarithms, covariance, misfit, minima, models)
