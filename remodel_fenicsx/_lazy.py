@@ -31,8 +31,7 @@ def resolved(maker: Callable[..., Any] | str) -> Callable[..., Any]:
 
 @functools.cache  # called in every iteration
 def _named(place: str) -> Callable[..., Any]:
-    maker: Callable[..., Any] = pkgutil.resolve_name(place)
-    return maker
+    return pkgutil.resolve_name(place)
 
 
 class Late:

@@ -218,8 +218,7 @@ def resolve_auto_settings(scene: Scene, domain: Domain | None = None) -> Scene:
 def mesh_of(scene: Scene, comm: MPI.Intracomm) -> Domain:
     """Return the mesh of a scene: of its body, or of a reduction's part of the body. Collective."""
     if KINEMATICS[scene.model.kinematics].reduced:
-        domain: Domain = scene.geometry.reductions[scene.model.kinematics].build(scene, comm)
-        return domain
+        return scene.geometry.reductions[scene.model.kinematics].build(scene, comm)
     return scene.geometry.build_with(scene.regions, scene.mesh, comm)
 
 

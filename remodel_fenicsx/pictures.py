@@ -27,6 +27,7 @@ from PIL.PngImagePlugin import PngInfo
 
 from remodel_fenicsx._version import __version__
 from remodel_fenicsx.errors import BAD_ENVIRONMENT, FigureError
+from remodel_fenicsx.model.tensors import Array, Flags
 from remodel_fenicsx.results.recording import (
     AMBIENT,
     ANGLE_COLOURS,
@@ -45,7 +46,6 @@ from remodel_fenicsx.system.files import TakenError, numbered, write_new
 if TYPE_CHECKING:
     import pyvista
 
-Array = NDArray[np.float64]
 Pixels = NDArray[np.uint8]
 
 ANGLE = "fibre_angle_deformed"  # field that colours the bodies
@@ -64,7 +64,7 @@ LIGHT: dict[str, Any] = {"ambient": AMBIENT, "diffuse": 1 - AMBIENT, "specular":
 def grid(
     whole: WholeBody,
     time: float,
-    shown: NDArray[np.bool_] | None = None,
+    shown: Flags | None = None,
     names: Collection[str] | None = None,
 ) -> pyvista.UnstructuredGrid:
     """Make the grid of the visible elements, undeformed, with the fields of a recorded time."""
@@ -272,7 +272,7 @@ class ViewOptions(NamedTuple):
         return x, y, z
 
 
-def visible_elements(whole: WholeBody, viewing: ViewOptions) -> NDArray[np.bool_]:
+def visible_elements(whole: WholeBody, viewing: ViewOptions) -> Flags:
     """Return which elements are visible: neither peeled nor cut off, (elements,)."""
     layers, count = viewing.layers, len(whole.depth)
     if layers is not None and not 1 <= layers <= count:
@@ -284,7 +284,7 @@ def visible_elements(whole: WholeBody, viewing: ViewOptions) -> NDArray[np.bool_
     return (whole.layer < (layers or count)) & ~_cut_off(whole, viewing.cut)
 
 
-def _cut_off(whole: WholeBody, cut: str | None) -> NDArray[np.bool_]:
+def _cut_off(whole: WholeBody, cut: str | None) -> Flags:
     """Return which elements are cut off: those that lie completely in front, (elements,)."""
     if cut is None:
         return np.zeros(len(whole.elements), dtype=bool)

@@ -11,7 +11,6 @@ from typing import TYPE_CHECKING
 
 import dolfinx.fem
 import numpy as np
-from numpy.typing import NDArray
 
 from remodel_fenicsx._renamed import with_old_names
 from remodel_fenicsx.body.domain import Domain, dof_of_node
@@ -32,12 +31,12 @@ from remodel_fenicsx.model.energy import (
     Tissue,
     mixture_matrix,
 )
+from remodel_fenicsx.model.tensors import Array, Flags, Integers
 from remodel_fenicsx.schema.settings import Cells, MEASURED_CELLS, Properties
 
 if TYPE_CHECKING:
     from mpi4py import MPI
 
-Array = NDArray[np.float64]
 
 # ---------------------------------------------------------------- unit cells at quadrature points
 
@@ -62,8 +61,8 @@ class CellField:
         self.quadrature = quadrature
         self.dimensions = quadrature.function(f"{name}_dimensions", (3,))
         self.axes = quadrature.function(f"{name}_axes", (3, 3))
-        self.dimension_values: Array = quadrature.values(self.dimensions, (3,))
-        self.axis_values: Array = quadrature.values(self.axes, (3, 3))
+        self.dimension_values = quadrature.values(self.dimensions, (3,))
+        self.axis_values = quadrature.values(self.axes, (3, 3))
         self.point_cells = UnitCell(
             self.dimension_values.reshape(-1, 3), self.axis_values.reshape(-1, 3, 3)
         )
@@ -172,10 +171,10 @@ class UnitCells(CellField):
                 drawn = cells.dimensions(domain.number_of_elements)
                 self.dimension_values[chosen] = drawn[domain.element_number[chosen]][:, None, :]
                 self.axis_values[chosen] = axes[chosen]
-        self.initial_dimensions: Array = self.dimension_values.copy()
+        self.initial_dimensions = self.dimension_values.copy()
 
     def _take(
-        self, measured: Mapping[str, Array], chosen: NDArray[np.bool_], axes: Array, length: float
+        self, measured: Mapping[str, Array], chosen: Flags, axes: Array, length: float
     ) -> None:
         """Set cells of chosen elements from measured fibres; `axes` replace undetermined axes."""
         at_points = {name: values[:, None, :] for name, values in measured.items()}
@@ -311,7 +310,7 @@ class State:
         loading.set(dict.fromkeys(loading.values, 0.0))
 
     @cached_property
-    def _dof_of_node(self) -> NDArray[np.int64]:
+    def _dof_of_node(self) -> Integers:
         return dof_of_node(self.loading.domain.mesh, self.kinematics.nodal_space(self.unknown))
 
     def gathered_displacement(self) -> Array | None:
@@ -703,9 +702,9 @@ class Parameters:
             return np.full(self.quadrature.shape, np.inf)
         return np.where(self.has_chains(), length.reshape(self.quadrature.shape), np.inf)
 
-    def has_chains(self) -> NDArray[np.bool_]:
+    def has_chains(self) -> Flags:
         """Return whether points have chains, (elements, points)."""
-        return np.asarray(self.at_points().network_modulus > 0.0).reshape(self.quadrature.shape)
+        return (self.at_points().network_modulus > 0.0).reshape(self.quadrature.shape)
 
     def nan_without_chains(self, values: Array) -> Array:
         """Return values (elements, points) with NaN at points without chains."""

@@ -12,7 +12,6 @@ from typing import Any
 
 import numpy as np
 from mpi4py import MPI
-from numpy.typing import NDArray
 
 from remodel_fenicsx.body.domain import dof_of_node
 from remodel_fenicsx.body.mesh_domain import shared
@@ -22,6 +21,7 @@ from remodel_fenicsx.errors import RemodelError, SOLVE_FAILED
 from remodel_fenicsx.body.wall import RoundWall
 from remodel_fenicsx.model.residual_stress import Loads, close_ring
 from remodel_fenicsx.fem.assembly import raise_on_all_ranks
+from remodel_fenicsx.model.tensors import Array
 from remodel_fenicsx.scene.scene import Scene, SceneError, too_soft
 from remodel_fenicsx.schema import processes
 from remodel_fenicsx.schema.settings import AS_GIVEN, EQUILIBRIUM, Natural
@@ -105,7 +105,6 @@ def unloaded(
 # Broyden's method for unloaded dimensions or nodes. Its first Jacobian assumes that loaded values
 # change as the unloaded ones do.
 
-Array = NDArray[np.float64]
 Said = Callable[[str], object]
 
 LEAST_SHARE = 1 / 16  # smallest load increment, as a fraction of the loads

@@ -47,7 +47,7 @@ def material_columns(*names: str) -> Columns:
     """Return columns of Green strain and second Piola-Kirchhoff stress, of one or two axes each."""
 
     def strain(m: Any) -> Array:
-        return np.asarray(np.swapaxes(m.F, -1, -2) @ m.F - np.eye(3)) / 2
+        return (np.swapaxes(m.F, -1, -2) @ m.F - np.eye(3)) / 2
 
     def stress(m: Any) -> Array:
         return np.linalg.solve(m.F, _nominal_stress(m))

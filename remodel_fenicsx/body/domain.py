@@ -161,7 +161,7 @@ class Domain:
         parts = (
             None if wanted is None or values is None else [values[numbers] for numbers in wanted]
         )
-        return np.asarray(self.comm.scatter(parts, root=0))
+        return self.comm.scatter(parts, root=0)
 
     def gather_nodes(self, values: npt.ArrayLike) -> npt.NDArray[Any] | None:
         """Gather values of the geometry nodes on rank 0, in input order. Collective.

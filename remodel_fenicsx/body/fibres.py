@@ -5,7 +5,6 @@ from __future__ import annotations
 import hashlib
 import itertools
 import logging
-from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -114,7 +113,7 @@ def read_fibre_file(path: Path) -> FibreFile:
 def _of_csv(data: bytes, file: str) -> tuple[dict[str, Array], Array | None]:
     """Read columns structure_tensor_xx, fibre_x, fibre_2_x ..., weight, angle, element, x, y, z."""
     columns = read_columns(data, file, OF_TABLES, SPELLINGS, EXPORTED)
-    groups: list[tuple[str, Sequence[str]]] = [
+    groups = [
         *OF_GROUPS.items(),
         ("places", "xyz"),
         *((name, [name]) for name in OF_ONE_COLUMN),

@@ -16,12 +16,12 @@ import numpy as np
 from remodel_fenicsx.body.gmsh_model import gmsh_model
 from remodel_fenicsx.body.mesh_faces import area_vectors, cap_volume, jacobian_determinants, rims
 from remodel_fenicsx.body.mesh_file import (
-    ORDERS,
     SURFACES,
     Block,
     Surface,
     gmsh_text,
     format_position,
+    in_gmsh_order,
     of_gmsh,
     split_quads,
     split_wedges,
@@ -163,8 +163,7 @@ def rounded(surface: Surface, places: Array, on_rims: Flags) -> Array:
 
 def nearest(points: Array, simplices: Integers, places: Array) -> tuple[Integers, Array]:
     """Return the index of the nearest edge or triangle to each position, and the nearest point."""
-    pair: Any = polygons(points, simplices).find_closest_cell(places, return_closest_point=True)
-    return pair
+    return polygons(points, simplices).find_closest_cell(places, return_closest_point=True)
 
 
 def polygons(points: Array, simplices: Integers) -> Any:
@@ -246,7 +245,7 @@ def _straightened(points: Array, tetrahedra: Integers) -> int:
     """Straighten edges of inverted elements until none is left; return the number of edges."""
     done: set[int] = set()
     body: Any = SimpleNamespace(
-        kind="tetrahedron", degree=2, points=points, cells=tetrahedra[:, ORDERS["tetra10"]]
+        kind="tetrahedron", degree=2, points=points, cells=in_gmsh_order("tetra10", tetrahedra)
     )
     while True:
         twisted = tetrahedra[(jacobian_determinants(body) <= 0).any(axis=1)]
@@ -300,14 +299,14 @@ def _extruded(surface: Surface, levels: Array, thickness: Array, normals: Array)
 
 
 def _folded(points: Array, tetrahedra: Integers) -> Flags:
-    return np.asarray(np.linalg.det(points[tetrahedra[:, 1:]] - points[tetrahedra[:, :1]]) <= 0)
+    return np.linalg.det(points[tetrahedra[:, 1:]] - points[tetrahedra[:, :1]]) <= 0
 
 
 def _crossed(inner: Array, outer: Array, thickness: Array) -> Flags:
     """Return where the wall reaches into another part of itself or of the lumen, (points,)."""
     from scipy.spatial import cKDTree
 
-    return np.asarray(cKDTree(inner).query(outer)[0] < MIN_CLEARANCE * thickness)
+    return cKDTree(inner).query(outer)[0] < MIN_CLEARANCE * thickness
 
 
 def _thinned(surface: Surface, faulty: Flags, allowed: Array, thickness: Array) -> Array:
@@ -381,7 +380,9 @@ def write_wall(
         for name, face in wall.faces.items()
     ]
     blocks += [
-        Block("tetra10", len(wall.faces) + 1 + wall.layers, wall.tetrahedra[:, ORDERS["tetra10"]])
+        Block(
+            "tetra10", len(wall.faces) + 1 + wall.layers, in_gmsh_order("tetra10", wall.tetrahedra)
+        )
     ]
     write_new(path, gmsh_text(wall.points, blocks, of_names).encode())
     inner, outer = (wall.faces[name] for name in ("inner", "outer"))

@@ -303,7 +303,7 @@ class FileBody(WithRegions, FromFile):
             ) from None
         except UnreadableFile as error:
             raise self._fault(str(error)) from None
-        self.check_boundary(file, boundary)
+        self.check_boundary(boundary)
         counts = f"{len(file.cells)} {file.kind[:-3]}ra of degree {file.degree}, "
         counts += f"{len(file.points)} nodes"
         log.info("%s: %s, SHA-256 %s", ", ".join([self._name, *file.surfaces]), counts, file.sha256)
@@ -392,7 +392,7 @@ class FileBody(WithRegions, FromFile):
             names={**file.names, 3: further | numbers},
         )
 
-    def check_boundary(self, file: MeshFile, boundary: mesh_faces.Boundary) -> None:
+    def check_boundary(self, boundary: mesh_faces.Boundary) -> None:
         """Check that the faces can be those of the body, on rank 0."""
 
     # ------------------------------------------------------------ supports
@@ -602,7 +602,7 @@ class MeshBody(WalledMesh, Unloads, FileBody):
     shape: Literal["mesh"] = "mesh"
     """Shape of the body."""
 
-    def check_boundary(self, file: MeshFile, boundary: mesh_faces.Boundary) -> None:
+    def check_boundary(self, boundary: mesh_faces.Boundary) -> None:
         """Check that inner and outer are not swapped, and warn of a wall of one element."""
         inner, outer = boundary.area("inner"), boundary.area("outer")
         if inner > outer:

@@ -123,7 +123,7 @@ def shared(
     mesh = dolfinx.mesh.create_mesh(
         comm, cells=none if cells is None else cells, x=points, e=symbolic_mesh(kind, degree)
     )
-    parts: list[Face] = boundary.faces
+    parts = boundary.faces
     rows = np.concatenate([part.facets for part in parts])
     numbers = np.repeat(np.arange(len(parts)), [len(part.facets) for part in parts])
     of_parts = _tags_of_facets(mesh, boundary.facets[rows], numbers)
@@ -133,7 +133,7 @@ def shared(
     }
     of_faces = np.array([faces[part.name] for part in parts], dtype=np.int32)[of_parts.values]
     tags = dolfinx.mesh.meshtags(mesh, of_parts.dim, of_parts.indices, of_faces)
-    more: dict[str, Any] = {"boundary": boundary, "part_tags": of_parts, "rims": lines}
+    more = {"boundary": boundary, "part_tags": of_parts, "rims": lines}
     domain = MeshDomain(
         mesh, tags, faces, shape, {"extent": extent}, regions, np.empty(0, np.int32), **more
     )

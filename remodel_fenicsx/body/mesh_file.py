@@ -24,6 +24,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from remodel_fenicsx._lazy import Late
 from remodel_fenicsx.body.gmsh_model import gmsh, gmsh_model
 from remodel_fenicsx.errors import UnreadableFile
 from remodel_fenicsx.model.tensors import Array, Integers
@@ -41,22 +42,8 @@ VOLUMES = {
 FACET_CORNERS = {"triangle": 3, "triangle6": 3, "quad": 4, "quad8": 4, "quad9": 4}
 WEDGE = "wedge"
 ALLOWED_ELEMENTS = "tetrahedra of 4 or 10 nodes, hexahedra of 8 or 27, wedges of 6"
-# By Gmsh's numbers of element types.
-GMSH_KINDS = {
-    15: "vertex", 1: "line", 8: "line3",
-    2: "triangle", 9: "triangle6", 3: "quad", 16: "quad8", 10: "quad9",
-    4: "tetra", 11: "tetra10", 5: "hexahedron", 12: "hexahedron27", 6: WEDGE,
-}  # fmt: skip
-# Gmsh's order of nodes, as indices into VTK's, which meshio uses:
-# https://gmsh.info/doc/texinfo/gmsh.html#Node-ordering,
-# https://vtk.org/doc/nightly/html (vtkTriQuadraticHexahedron).
-ORDERS = {
-    "tetra10": (0, 1, 2, 3, 4, 5, 6, 7, 9, 8),
-    "hexahedron27": (
-        0, 1, 2, 3, 4, 5, 6, 7, 8, 11, 16, 9, 17, 10, 18, 19, 12, 15, 13, 14,
-        24, 22, 20, 21, 23, 25, 26
-    ),
-}  # fmt: skip
+# Gmsh's numbers of element types and its orders of nodes, by meshio's names.
+gmsh_format = Late("meshio.gmsh.common")
 
 
 @dataclass(frozen=True, eq=False)
@@ -168,7 +155,7 @@ def read_exchange_file(path: Path) -> ExchangeFile:
 def arrays_xdmf(file: str) -> Arrays:
     """Read the arrays of an XDMF file."""
     mesh = importlib.import_module("meshio.xdmf").read(file)
-    cells = [_in_gmsh_order(block.type, block.data) for block in mesh.cells]
+    cells = [(block.type, in_gmsh_order(block.type, block.data)) for block in mesh.cells]
     of_cells = {name: np.concatenate(values) for name, values in mesh.cell_data.items()}
     return as_arrays(mesh.points, cells, mesh.point_data, of_cells)
 
@@ -201,7 +188,8 @@ def _of_vtk(module: str, reader: str, file: str) -> Arrays:
     cells = []
     for start, stop in itertools.pairwise([0, *changes.tolist(), len(types)]):
         rows = nodes[starts[start] : starts[stop]].reshape(stop - start, -1)
-        cells.append(_in_gmsh_order(vtk_to_meshio_type[int(types[start])], rows))
+        kind = vtk_to_meshio_type[int(types[start])]
+        cells.append((kind, in_gmsh_order(kind, rows)))
     points = numbers(grid.GetPoints().GetData())
     return as_arrays(points, cells, vtk_arrays(grid.GetPointData()), vtk_arrays(grid.GetCellData()))
 
@@ -254,7 +242,7 @@ def of_gmsh(by_number: bool = False) -> tuple[Array, list[Block]]:
             continue
         groups: list[int] = [*model.getPhysicalGroupsForEntity(dimension, entity)]
         for kind, numbers, nodes in zip(*model.mesh.getElements(dimension, entity), strict=True):
-            name = GMSH_KINDS.get(kind) or model.mesh.getElementProperties(kind)[0]
+            name = gmsh_format._gmsh_to_meshio_type[kind]
             rows = np.searchsorted(tags, nodes, sorter=order).reshape(len(numbers), -1)
             parts_of_kind.setdefault(name, []).extend(
                 (numbers, np.full(len(rows), group), rows) for group in groups or [0]
@@ -281,8 +269,9 @@ def as_arrays(
     return {"names": np.frombuffer(json.dumps(names).encode(), np.uint8), **listed}
 
 
-def _in_gmsh_order(kind: str, rows: Integers) -> tuple[str, Integers]:
-    return kind, rows[:, ORDERS.get(kind, slice(None))]
+def in_gmsh_order(kind: str, rows: Integers) -> Integers:
+    """Return rows of nodes in Gmsh's order, from VTK's order, which meshio uses."""
+    return gmsh_format._meshio_to_gmsh_order(kind, rows)
 
 
 # ---------------------------------------------------------------- surfaces
@@ -675,7 +664,7 @@ def gmsh_text(
     points: Array, blocks: Iterable[Block], names: Mapping[int, Mapping[str, int]]
 ) -> str:
     """Format a mesh as a Gmsh file, format 2.2, with nodes numbered 1, 2, ... in their order."""
-    numbers = {kind: number for number, kind in GMSH_KINDS.items()}
+    numbers = gmsh_format._meshio_to_gmsh_type
     groups = [
         f'{dimension} {number} "{name}"'
         for dimension, by in names.items()

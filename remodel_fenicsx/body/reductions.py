@@ -153,10 +153,6 @@ class ReducedScene(Protocol):
 
 Rule = Callable[[ReducedScene], str | None]
 Turn = Callable[[Array], Array]
-POINTS = {
-    ("interval", 1): 2, ("interval", 2): 3, ("quadrilateral", 1): 4, ("quadrilateral", 2): 9,
-    ("hexahedron", 1): 8, ("hexahedron", 2): 27, ("tetrahedron", 1): 1, ("tetrahedron", 2): 4,
-}  # fmt: skip
 OVERHEAD_IN_POINTS = 60.0  # a step's cost independent of the mesh, in points of hexahedra
 
 
@@ -332,11 +328,15 @@ def too_many_elements(scene: ReducedScene) -> str:
 
 def step_cost(scene: ReducedScene, name: str) -> float:
     """Estimate the cost of a step from its quadrature points; 1 is a point of a hexahedron."""
+    import basix
+    from remodel_fenicsx.fem.quadrature import DEGREES
+
     kinematics, mesh = KINEMATICS[name], scene.mesh
     element, number = kinematics.element(mesh.element), elements(scene, name)
     if element == "tetrahedron":
         number *= 6
-    return OVERHEAD_IN_POINTS + kinematics.cost * number * POINTS[element, mesh.degree]
+    _, weights = basix.make_quadrature(basix.CellType[element], DEGREES[element, mesh.degree])
+    return OVERHEAD_IN_POINTS + kinematics.cost * number * np.size(weights)
 
 
 def _leaves_symmetry(scene: ReducedScene) -> str:

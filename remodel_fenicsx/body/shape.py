@@ -128,6 +128,7 @@ class Column:
 
 
 Columns = tuple[Column, ...]
+Proportions = tuple[tuple[str, str, float, tuple[float, float]], ...]
 
 
 # ---------------------------------------------------------------- fibre angle over depth
@@ -646,7 +647,7 @@ class Shape(_Is):  # type: ignore[misc]
         raise NotImplementedError(f"a {self.name} has no section across z")
 
     @property
-    def proportions(self) -> tuple[tuple[str, str, float, tuple[float, float]], ...]:
+    def proportions(self) -> Proportions:
         """Ratios of lengths that reveal wrong units: key, label, ratio, usual decades."""
         return ()
 
@@ -1081,7 +1082,7 @@ def homogeneous_bar(
 
         shape, length = scene.geometry, scene.geometry.axial_length
         faces = {bottom: lambda x: np.isclose(x[2], 0.0), top: lambda x: np.isclose(x[2], length)}
-        degree: int = scene.mesh.degree
+        degree = scene.mesh.degree
         share = np.linspace(0.0, 1.0, degree + 1)[:, None]
         points = length * ([1.0, 0.0, 0.0] + share * [0.0, 0.0, 1.0])
         return lattice_domain(points, [1], degree, faces, shape.name, dimensions(shape), comm)

@@ -11,6 +11,7 @@ from pydantic import Field, model_validator
 from remodel_fenicsx.body import gmsh_model as model
 from remodel_fenicsx.body.reductions import Strut, cylinder
 from remodel_fenicsx.body.shape import (
+    Proportions,
     WithAxes,
     axial_dead_force,
     cauchy_columns,
@@ -95,7 +96,7 @@ class Tendon(WithAxes):
         return self.area
 
     @property
-    def proportions(self) -> tuple[tuple[str, str, float, tuple[float, float]], ...]:
+    def proportions(self) -> Proportions:
         """Proportions of tendons, which are neither plates nor threads."""
         return (("length", "length / sqrt(area)", self.length / math.sqrt(self.area), (-2, 3)),)
 

@@ -21,6 +21,7 @@ from remodel_fenicsx.body.shape import (
     End,
     LoadKind,
     Loads,
+    Proportions,
     Regions,
     Shape,
     Supports,
@@ -548,7 +549,7 @@ class Tube(RoundWall):
         return math.pi * (self.outer_radius**2 - self.inner_radius**2)
 
     @property
-    def proportions(self) -> tuple[tuple[str, str, float, tuple[float, float]], ...]:
+    def proportions(self) -> Proportions:
         """Proportions of vessels, which are neither rings nor threads."""
         outer = self.outer_radius
         return (

@@ -19,6 +19,7 @@ from remodel_fenicsx.fem.assembly import allreduce
 from remodel_fenicsx.model.cells import UnitCell
 from remodel_fenicsx.model.energy import Tissue
 from remodel_fenicsx.model.tensor_law import Target, weight_of_the_end
+from remodel_fenicsx.model.tensors import Array, Flags
 from remodel_fenicsx.schema.settings import Solver
 from remodel_fenicsx.solver.attempts import FROM_PREDICTION, FROM_PREVIOUS, Attempt, say
 from remodel_fenicsx.solver.continuation import CellHomotopy, Continuation, Work
@@ -26,8 +27,6 @@ from remodel_fenicsx.solver.equilibrium import Equilibrium
 from remodel_fenicsx.solver.newton import GuardedNewton, SolveFailure, attempted
 from remodel_fenicsx.state import FieldHistory, StateNumbers, State
 
-Array = NDArray[np.float64]
-Flags = NDArray[np.bool_]
 log = logging.getLogger(__name__)
 
 # Record of a target at one point.
@@ -84,7 +83,7 @@ class Predictor:
         speed = speeds[0]
         if len(speeds) == SUMMED + FITTED:
             speed = self._weights(speeds) @ np.array(speeds[:SUMMED])
-        values: Array = state.unknown.x.array + step.duration * speed
+        values = state.unknown.x.array + step.duration * speed
         for condition in state.loading.boundary_conditions:
             condition.set(values)
         return values

@@ -15,19 +15,18 @@ from functools import partial
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from remodel_fenicsx.body.loading import LoadValues
 from remodel_fenicsx.evolution.stepper import Step, Stepper, Watcher
 from remodel_fenicsx.evolution.time_steps import StepControl
 from remodel_fenicsx.fem import assembly
+from remodel_fenicsx.model.tensors import Array
 from remodel_fenicsx.solver.continuation import StepFailure, Work
 from remodel_fenicsx.solver.newton import attempted
 from remodel_fenicsx.state import Snapshot
 from remodel_fenicsx.system import NOTICE
 
 log = logging.getLogger(__name__)
-Array = NDArray[np.float64]
 
 PATH_TOLERANCE, UNLOADING_PATH_TOLERANCE = 3.0, 0.5
 """Time tolerance in degrees if the scene sets none: for monotonic loading, and for unloading or
@@ -265,7 +264,7 @@ class Homeostasis:
         """Return the sum of products over all ranks. Collective."""
         return float(self.state.comm.allreduce(float(self.quadrature.owned(first * second).sum())))
 
-    def _largest_jump(self) -> tuple[float, NDArray[np.float64]]:
+    def _largest_jump(self) -> tuple[float, Array]:
         """Return the largest jump of A/r0^2 between near points, and its position. Collective."""
         # All ranks take part, because a neighbour may belong to another rank.
         from scipy.spatial import cKDTree  # imported here, because only these runs need it

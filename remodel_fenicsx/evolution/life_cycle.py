@@ -6,8 +6,8 @@ from collections.abc import Callable, Sequence
 from typing import TYPE_CHECKING, Any, TypeAlias
 
 import numpy as np
-from numpy.typing import NDArray
 
+from remodel_fenicsx.model.tensors import Array
 from remodel_fenicsx.solver.continuation import Work
 
 if TYPE_CHECKING:
@@ -15,7 +15,6 @@ if TYPE_CHECKING:
     from remodel_fenicsx.evolution.stepper import Stepper, Watcher
     from remodel_fenicsx.scene.scene import Scene
 
-Array = NDArray[np.float64]
 
 Values: TypeAlias = Any  # type: ignore[explicit-any]
 """Values of a remodeling process at all points; its class defines the type."""

@@ -10,7 +10,6 @@ import numpy as np
 import ufl
 from dolfinx.fem import Function
 from mpi4py import MPI
-from numpy.typing import NDArray
 
 from remodel_fenicsx.evolution.life_cycle import Remodels
 from remodel_fenicsx.fem import jit
@@ -29,12 +28,12 @@ from remodel_fenicsx.model.laws import (
     tensor_target,
 )
 from remodel_fenicsx.model.tensor_law import MIN_TENSION_OVER_ROUNDING, Target, switch_threshold
+from remodel_fenicsx.model.tensors import Array, Flags
 from remodel_fenicsx.schema.settings import COUPLINGS, Remodeling
 from remodel_fenicsx.solver.equilibrium import PointStresses
 from remodel_fenicsx.state import StateNumbers, State, stress_rounding
 
 log = logging.getLogger(__name__)
-Array = NDArray[np.float64]
 
 # Bound of the stress error, as a multiple of residual / smallest face area. The residual may
 # act at one of the eight nodes of an element alone, and then corresponds to a stress of up to 8
@@ -256,11 +255,11 @@ class RemodelingPass(Remodels):
     def _averages_targets(self) -> bool:
         return bool(self.further) and MEANS_OF_CASES[self.settings.mean].of_targets
 
-    def without_tension(self, residual: float = 0.0) -> NDArray[np.bool_]:
+    def without_tension(self, residual: float = 0.0) -> Flags:
         """Return flags (n,) of points with no or hardly any tension."""
         drive = self.drive(residual)
         if self.law.target is not None:
-            return np.asarray(self.target(residual).switch < MIN_ACTIVATION)
+            return self.target(residual).switch < MIN_ACTIVATION
         values = np.linalg.eigvalsh(drive.tensor)
         return ~spectral.positive_direction(values, threshold=drive.noise)[1]
 
@@ -382,4 +381,4 @@ class RemodelingPass(Remodels):
         """Return the change of A by a pass up to a time, (elements, points, 3, 3)."""
         remodeled, _ = self.updated_cells(self.state.time, time, residual)
         present = self.state.cells.structure_tensor()
-        return np.asarray(structure_tensor(*remodeled[:2]).reshape(present.shape) - present)
+        return structure_tensor(*remodeled[:2]).reshape(present.shape) - present

@@ -10,18 +10,16 @@ from dataclasses import dataclass
 from functools import partial
 
 import numpy as np
-from numpy.typing import NDArray
 
 from remodel_fenicsx.evolution.life_cycle import Remodels, Values
 from remodel_fenicsx.evolution.stepper import LoadCaseSolver, Step, Stepper, Watcher
-from remodel_fenicsx.model.tensors import max_stretch_increment
+from remodel_fenicsx.model.tensors import max_stretch_increment, Array
 from remodel_fenicsx.solver.attempts import SHORTER_STEP, say
 from remodel_fenicsx.solver.continuation import StepFailure
 from remodel_fenicsx.solver.newton import attempted
 from remodel_fenicsx.state import FieldHistory, StateNumbers
 
 log = logging.getLogger(__name__)
-Array = NDArray[np.float64]
 
 
 # ---------------------------------------------------------------- error of a row

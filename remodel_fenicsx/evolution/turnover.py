@@ -7,7 +7,6 @@ from dataclasses import replace
 from typing import TYPE_CHECKING
 
 import numpy as np
-from numpy.typing import NDArray
 
 from remodel_fenicsx.evolution.life_cycle import Remodels
 from remodel_fenicsx.evolution.stepper import Step, Stepper, WarnsOnce
@@ -15,6 +14,7 @@ from remodel_fenicsx.fem.kinematics import NaturalConfiguration
 from remodel_fenicsx.model.axes import GROWTH
 from remodel_fenicsx.model.energy import TURNED_OVER, Tissue
 from remodel_fenicsx.model.laws import TurnoverRates
+from remodel_fenicsx.model.tensors import Array
 from remodel_fenicsx.schema.processes.turnover import Turnover
 from remodel_fenicsx.schema.settings import Remodeling
 from remodel_fenicsx.solver.continuation import StepFailure, Work
@@ -24,7 +24,6 @@ from remodel_fenicsx.state import FieldHistory, StateNumbers, State
 if TYPE_CHECKING:
     from remodel_fenicsx.scene.scene import Scene
 
-Array = NDArray[np.float64]
 
 # Smallest volume, relative to the initial one. With less the tissue is lost, and the step fails.
 LEAST_VOLUME = 0.05
@@ -68,11 +67,11 @@ class Growth:
     @property
     def ratio(self) -> Array:
         """Volume ratio of growth, J_g, (elements, points)."""
-        return np.asarray(np.linalg.det(self._initial) / np.linalg.det(self._gradient))
+        return np.linalg.det(self._initial) / np.linalg.det(self._gradient)
 
     def share(self, content: Array) -> Array:
         """Return the volume fraction of collagen, phi m/(m_ref J_g), (elements, points)."""
-        return np.asarray(self.settings.volume * content / (self._reference * self.ratio))
+        return self.settings.volume * content / (self._reference * self.ratio)
 
     def set_initial(self, content: Array, ratio: Array) -> None:
         """Set J_g of an earlier run, and the reference content m_ref that gives this J_g."""
@@ -82,9 +81,7 @@ class Growth:
 
     def volume_ratio(self, content: Array) -> Array:
         """Return J_g for a content, (n,) or (elements, points); the result has the same shape."""
-        return np.asarray(
-            1.0 + self.settings.volume * (content / self._reference.reshape(content.shape) - 1.0)
-        )
+        return 1.0 + self.settings.volume * (content / self._reference.reshape(content.shape) - 1.0)
 
     def set_content(self, content: Array) -> None:
         """Set J_g = 1 + phi (m/m_ref - 1) and G = G_0 (1 - (1 - 1/J_g) N (x) N)."""
@@ -262,7 +259,7 @@ class TurnoverPass(Remodels):
 
     def change_to_limit(self, time: float, duration: float, residual: float) -> Array:
         """Return the changes over a duration, because turnover has no pass to a limit."""
-        return np.asarray(self.rates().T * duration).reshape(*self.quadrature.shape, 2)
+        return (self.rates().T * duration).reshape(*self.quadrature.shape, 2)
 
     def size(self, change: Array) -> float:
         """Return the largest relative change."""

@@ -13,7 +13,6 @@ import dolfinx.la
 import numpy as np
 import ufl
 from mpi4py import MPI
-from numpy.typing import NDArray
 from petsc4py import PETSc
 from ufl.algorithms.map_integrands import map_integrands
 from ufl.classes import Determinant, Inner, Sqrt, Trace
@@ -23,6 +22,7 @@ from ufl.domain import extract_unique_domain
 from remodel_fenicsx.fem import jit
 from remodel_fenicsx.fem.kinematics import lagrange
 from remodel_fenicsx.fem.solver_methods import ProblemOptions, levels_options
+from remodel_fenicsx.model.tensors import Array
 
 if TYPE_CHECKING:
     from dolfinx.fem import Constant, DirichletBC, Form, Function, FunctionSpace
@@ -221,7 +221,7 @@ def coefficient(mesh: Mesh, name: str, value: float | Constant | Function) -> Co
     return own
 
 
-def point_values(value: Constant | Function, quadrature: Quadrature) -> NDArray[np.float64]:
+def point_values(value: Constant | Function, quadrature: Quadrature) -> Array:
     """Return a coefficient's values at the quadrature points, (elements, points), with ghosts."""
     if isinstance(value, dolfinx.fem.Function):
         dofmap = value.function_space.dofmap
@@ -254,11 +254,11 @@ class CachedValue(Generic[T]):
         ]
         # Arrays are the functions' own memory. Small ones come first, because one difference is
         # enough.
-        self._arrays: list[NDArray[np.float64]] = sorted(
+        self._arrays: list[Array] = sorted(
             (f.x.array for f in functions), key=lambda array: array.size
         )
         self._numbers = [np.asarray(c.value) for c in constants]
-        self._seen: list[NDArray[np.float64]] = []
+        self._seen: list[Array] = []
         self._seen_numbers: list[bytes] | None = None
         self._value: T
 

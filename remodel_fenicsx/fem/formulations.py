@@ -12,10 +12,10 @@ from types import MappingProxyType
 from typing import Any, TYPE_CHECKING
 
 import numpy as np
-from numpy.typing import NDArray
 
 from remodel_fenicsx._renamed import with_old_names
 from remodel_fenicsx._lazy import Late
+from remodel_fenicsx.model.tensors import Array
 
 if TYPE_CHECKING:
     from dolfinx.fem import Function
@@ -28,7 +28,6 @@ if TYPE_CHECKING:
     from remodel_fenicsx.model.energy import Stresses, Tissue
 
 ufl, basix = Late("ufl"), Late("basix")
-Array = NDArray[np.float64]
 
 
 class DiscreteFormulation:

@@ -26,13 +26,13 @@ import ffcx.codegeneration.jit
 import ffcx.options
 import numpy as np
 from mpi4py import MPI
-from numpy.typing import NDArray
 from ufl import as_vector
 from ufl.classes import Label
 from ufl.corealg.map_dag import map_expr_dag
 from ufl.corealg.multifunction import MultiFunction
 from ufl.domain import extract_unique_domain
 
+from remodel_fenicsx.model.tensors import Array
 from remodel_fenicsx.system.interrupts import held_back, raise_on_signal
 from remodel_fenicsx.system import NOTICE
 
@@ -78,12 +78,8 @@ _KINDS = {
     2: ("the tangent", 3, TANGENT_FLAGS),
 }
 
-_compiled: list[str] = []
-
-
-def compiled_kernels() -> tuple[str, ...]:
-    """Return the names of the kernels that this process has compiled, not those from the cache."""
-    return tuple(_compiled)
+compiled_kernels: list[str] = []
+"""Names of the kernels that this process has compiled, not of those from the cache."""
 
 
 @functools.cache
@@ -168,7 +164,7 @@ def form(ufl_form: Form, name: str | None = None) -> dolfinx.fem.Form:
 
 def expression(
     ufl_expression: Expr,
-    points: NDArray[np.float64],
+    points: Array,
     name: str | None = None,
 ) -> list[dolfinx.fem.Expression]:
     """Compile a UFL expression for evaluation at reference points, (n, 3). See `form`.
@@ -285,7 +281,7 @@ def _compiling(kernel: str, what: str, seconds: int) -> Iterator[None]:
         start = clock.monotonic()
         yield
         log.info("compiled %s in %.1f s: %s", what, clock.monotonic() - start, kernel)
-        _compiled.append(kernel)
+        compiled_kernels.append(kernel)
         if os.environ.get(COMPILED_LOG_VARIABLE):
             with open(os.environ[COMPILED_LOG_VARIABLE], "a") as file:
                 file.write(f"{kernel}\n")

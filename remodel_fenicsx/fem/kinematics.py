@@ -10,10 +10,10 @@ from collections.abc import Mapping
 from typing import Any, ClassVar, TYPE_CHECKING
 
 import numpy as np
-from numpy.typing import NDArray
 
 from remodel_fenicsx._renamed import with_old_names
 from remodel_fenicsx._lazy import Late
+from remodel_fenicsx.model.tensors import Array
 
 if TYPE_CHECKING:
     from dolfinx.fem import Constant, Function, FunctionSpace
@@ -22,7 +22,6 @@ if TYPE_CHECKING:
 
 ufl, basix_ufl = Late("ufl"), Late("basix.ufl")
 fem = Late("dolfinx.fem")
-Array = NDArray[np.float64]
 
 
 @with_old_names
@@ -375,7 +374,7 @@ class PointKinematics(_Reduced):
 
     def nodal_displacement(self, unknown: Function) -> Array:
         """Return the displacement of the nodes of the bar, (nodes, 3)."""
-        places: Array = self._nodes.tabulate_dof_coordinates()
+        places = self._nodes.tabulate_dof_coordinates()
         # a rank without the element has neither nodes nor numbers
         return (
             places * unknown.x.array.reshape(-1, 3)[:1] / self.body.axial_length
@@ -526,7 +525,7 @@ class FreeLength(_WithNumbers):
 
     def nodal_displacement(self, unknown: Function) -> Array:
         """Return the displacement of the local nodes, (nodes, 3). Collective."""
-        places: Array = self.nodal_space(unknown).tabulate_dof_coordinates()
+        places = self.nodal_space(unknown).tabulate_dof_coordinates()
         displacement = super().nodal_displacement(unknown)
         displacement[:, 2] += self.strain_of_length(unknown) * places[:, 2]
         return displacement
@@ -593,7 +592,7 @@ def global_constant_space(space: FunctionSpace, component: int) -> FunctionSpace
     one = comm.bcast(offset + int(owned.sum()), root=owner)
     is_ghost = has_elements and not is_owner
     new_ghosts = numbers.array[old.size_local :][ghosts].astype(np.int64)
-    owners = np.asarray(old.owners)[ghosts]
+    owners = old.owners[ghosts]
     if is_ghost:
         new_ghosts, owners = np.append(new_ghosts, one), np.append(owners, owner)
     place = np.zeros(len(is_one), dtype=np.int32)

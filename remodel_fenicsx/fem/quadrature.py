@@ -19,6 +19,7 @@ from remodel_fenicsx._renamed import with_old_names
 from remodel_fenicsx.fem import jit
 from remodel_fenicsx.fem.assembly import allgather, allreduce
 from remodel_fenicsx.fem.compat import geometry_dofmap
+from remodel_fenicsx.model.tensors import Array
 
 if TYPE_CHECKING:
     from dolfinx.fem import Function, FunctionSpace
@@ -37,7 +38,7 @@ DEGREES = {
 }
 
 
-def shape_functions(kind: str, degree: int, points: NDArray[np.float64]) -> NDArray[np.float64]:
+def shape_functions(kind: str, degree: int, points: Array) -> Array:
     """Return values, then slopes of a Lagrange element, (1 + dimension, points, nodes)."""
     family, variant = basix.ElementFamily.P, basix.LagrangeVariant.gll_warped
     element = basix.create_element(
@@ -51,7 +52,7 @@ def point_values(
     mesh: Mesh,
     elements: NDArray[np.int32],
     points: int,
-) -> NDArray[np.float64]:
+) -> Array:
     """Evaluate a compiled expression (`jit.expression`), (elements, points, components)."""
     values = [
         part.eval(mesh, elements).reshape(len(elements), points, *part.ufl_expression.ufl_shape)
@@ -111,12 +112,12 @@ class Quadrature:
     def __init__(self, mesh: Mesh, element_degree: int, weight: Expr | float = 1):
         self.mesh, self.element_degree = mesh, element_degree
         self._spaces: dict[tuple[int, ...], FunctionSpace] = {}
-        self._complements: dict[int, NDArray[np.float64]] = {}
+        self._complements: dict[int, Array] = {}
         self.element_kind = mesh.topology.cell_name()
         self.degree = DEGREES[self.element_kind, element_degree]
         points, weights = basix.make_quadrature(basix.CellType[self.element_kind], self.degree)
-        self.points: NDArray[np.float64] = np.asarray(points, dtype=np.float64)
-        self.weights: NDArray[np.float64] = np.asarray(weights, dtype=np.float64)
+        self.points = np.asarray(points, dtype=np.float64)
+        self.weights = np.asarray(weights, dtype=np.float64)
         dimension = mesh.topology.dim
         elements = mesh.topology.index_map(dimension)
         self.number_of_owned_elements = elements.size_local
@@ -124,7 +125,7 @@ class Quadrature:
         self.shape = len(self.elements), len(self.weights)
         self.coordinates, lengths = self._geometry()
         # the product of an element's extents is |det J|, on lines and surfaces too
-        self.volumes: NDArray[np.float64] = lengths.prod(axis=2) * self.weights
+        self.volumes: Array = lengths.prod(axis=2) * self.weights
         self.extent = float(
             (self.integral(np.ones(self.shape)) / elements.size_global) ** (1 / dimension)
         )
@@ -133,11 +134,11 @@ class Quadrature:
                 jit.expression(weight, self.points, "the volume of the body per unit of mesh"), ()
             )
         self.volumes = self.volumes * weight
-        self.smallest_lengths: NDArray[np.float64] = np.asarray(lengths[..., -1], dtype=np.float64)
-        self.largest_areas: NDArray[np.float64] = (self.volumes / lengths[..., -1]).sum(axis=1)
-        self.smallest_areas: NDArray[np.float64] = (self.volumes / lengths[..., 0]).sum(axis=1)
+        self.smallest_lengths = np.asarray(lengths[..., -1], dtype=np.float64)
+        self.largest_areas: Array = (self.volumes / lengths[..., -1]).sum(axis=1)
+        self.smallest_areas: Array = (self.volumes / lengths[..., 0]).sum(axis=1)
 
-    def _geometry(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    def _geometry(self) -> tuple[Array, Array]:
         """Return points and the Jacobian's singular values, descending, (elements, points, ...)."""
         element = self.mesh.ufl_domain().ufl_coordinate_element().basix_element
         functions = element.tabulate(1, self.points)[..., 0]
@@ -169,7 +170,7 @@ class Quadrature:
             self._spaces[value_shape] = dolfinx.fem.functionspace(self.mesh, element)
         return dolfinx.fem.Function(self._spaces[value_shape], name=name)
 
-    def values(self, function: Function, value_shape: tuple[int, ...]) -> NDArray[np.float64]:
+    def values(self, function: Function, value_shape: tuple[int, ...]) -> Array:
         """Return the function's own memory as an array ``(elements, points, *value_shape)``."""
         return function.x.array.reshape(*self.shape, *value_shape)
 
@@ -177,7 +178,7 @@ class Quadrature:
         self,
         expression: Sequence[dolfinx.fem.Expression],
         value_shape: tuple[int, ...],
-    ) -> NDArray[np.float64]:
+    ) -> Array:
         """Evaluate a compiled expression at the points, ``(elements, points, *value_shape)``."""
         values = point_values(expression, self.mesh, self.elements, self.shape[1])
         return values.reshape(*self.shape, *value_shape)
@@ -186,18 +187,16 @@ class Quadrature:
         """Return the rows of the elements that this rank owns, (owned elements, ...)."""
         return values[: self.number_of_owned_elements]
 
-    def integral(self, values: NDArray[np.float64]) -> float:
+    def integral(self, values: Array) -> float:
         """Integrate values (elements or owned elements, points) over the body. Collective."""
         local = float((self.owned(values) * self.owned(self.volumes)).sum())
         return float(allreduce(self.mesh.comm, local, MPI.SUM))
 
-    def mean(self, values: NDArray[np.float64]) -> float:
+    def mean(self, values: Array) -> float:
         """Return the volume mean of values (elements, points). Collective."""
         return self.integral(values) / self.volume
 
-    def nanmean(
-        self, values: NDArray[np.float64], weights: NDArray[np.float64] | None = None
-    ) -> float:
+    def nanmean(self, values: Array, weights: Array | None = None) -> float:
         """Return the volume mean over the points whose value is not NaN. Collective.
 
         The mean is NaN if all values are NaN.
@@ -222,7 +221,7 @@ class Quadrature:
         )
 
     @cached_property
-    def gradients(self) -> NDArray[np.float64]:
+    def gradients(self) -> Array:
         """G with ``|grad u| <= G max |u_node|`` in each element, (elements,)."""
         slopes = shape_functions(self.element_kind, self.element_degree, self.points)[1:]
         sums = np.linalg.norm(slopes, axis=0).sum(axis=-1)
@@ -238,11 +237,11 @@ class Quadrature:
         """Volume of the body, over all ranks. Collective on first access."""
         return self.integral(np.ones(self.shape))
 
-    def element_mean(self, values: NDArray[np.float64]) -> NDArray[np.float64]:
+    def element_mean(self, values: Array) -> Array:
         """Return the volume mean over each element, (elements, points, ...) to (elements, ...)."""
         return np.einsum("ep,ep...->e...", self._shares, values)
 
-    def element_nanmean(self, values: NDArray[np.float64]) -> NDArray[np.float64]:
+    def element_nanmean(self, values: Array) -> Array:
         """Return each element's volume mean without NaN, (elements, points) to (elements,)."""
         known = ~np.isnan(values)
         sums, shares = self.element_mean(np.where(known, values, 0.0)), self.element_mean(
@@ -251,11 +250,11 @@ class Quadrature:
         return np.divide(sums, shares, out=np.full_like(sums, np.nan), where=shares > 0)
 
     @cached_property
-    def _shares(self) -> NDArray[np.float64]:
+    def _shares(self) -> Array:
         """Volume fraction of each quadrature point in its element, (elements, points)."""
         return self.volumes / self.volumes.sum(axis=1, keepdims=True)
 
-    def polynomial_residual(self, degree: int, values: NDArray[np.float64]) -> NDArray[np.float64]:
+    def polynomial_residual(self, degree: int, values: Array) -> Array:
         """Return values (owned elements, points, n) minus a least-squares polynomial.
 
         Each element has its own polynomial of this degree. In elements of a single point it is
@@ -267,15 +266,15 @@ class Quadrature:
             self._complements[degree] = np.eye(self.shape[1]) - self._fitted(degree, self.points)
         return self._complements[degree] @ values
 
-    def _fitted(self, degree: int, points: NDArray[np.float64]) -> NDArray[np.float64]:
+    def _fitted(self, degree: int, points: Array) -> Array:
         """Return the matrix from values to their least-squares polynomial at other points."""
         polynomials, elsewhere = (
             shape_functions(self.element_kind, degree, x)[0] for x in (self.points, points)
         )
         roots = np.sqrt(self.weights)[:, None]
-        return np.asarray(elsewhere @ (np.linalg.pinv(roots * polynomials) * roots.T))
+        return elsewhere @ (np.linalg.pinv(roots * polynomials) * roots.T)
 
-    def superconvergent(self, values: NDArray[np.float64]) -> NDArray[np.float64]:
+    def superconvergent(self, values: Array) -> Array:
         """Return values (elements, points, n) at superconvergent points.
 
         The result has shape (elements, fewer points, n). At these points gradients converge one
@@ -284,21 +283,21 @@ class Quadrature:
         """
         return self._fitted(self.element_degree - 1, self._superconvergent_points) @ values
 
-    def superconvergent_from_nodes(self, values: NDArray[np.float64]) -> NDArray[np.float64]:
+    def superconvergent_from_nodes(self, values: Array) -> Array:
         """Interpolate nodal values (elements, nodes) to the superconvergent points."""
-        return np.asarray(values @ self._node_functions(self._superconvergent_points).T)
+        return values @ self._node_functions(self._superconvergent_points).T
 
-    def _node_functions(self, points: NDArray[np.float64]) -> NDArray[np.float64]:
+    def _node_functions(self, points: Array) -> Array:
         """Return the geometry's shape functions at points of an element, (points, nodes)."""
         geometry = self.mesh.geometry
         return shape_functions(self.element_kind, geometry.cmap.degree, points)[0]
 
     @cached_property
-    def _superconvergent_points(self) -> NDArray[np.float64]:
+    def _superconvergent_points(self) -> Array:
         kind = basix.CellType[self.element_kind]
         return np.asarray(basix.make_quadrature(kind, max(1, 2 * self.element_degree - 2))[0])
 
-    def jumps(self, values: NDArray[np.float64]) -> NDArray[np.float64]:
+    def jumps(self, values: Array) -> Array:
         """Return mean-square jumps of values (owned elements, points, n) to adjacent elements.
 
         Values are extrapolated to the element's nodes, and compared with the mean over all elements
@@ -308,11 +307,11 @@ class Quadrature:
         return np.square(continued - self._means_at_nodes(continued)).sum(axis=-1).mean(axis=-1)
 
     @cached_property
-    def _extrapolation(self) -> NDArray[np.float64]:
+    def _extrapolation(self) -> Array:
         """Matrix from values at an element's points to those at its nodes, (nodes, points)."""
         return np.asarray(np.linalg.pinv(self._node_functions(self.points)))
 
-    def _means_at_nodes(self, values: NDArray[np.float64]) -> NDArray[np.float64]:
+    def _means_at_nodes(self, values: Array) -> Array:
         """Return nodal means by volume of values (owned elements, nodes or 1, n). Collective."""
         nodes, number = (
             geometry_dofmap(self.mesh)[: self.number_of_owned_elements],
@@ -324,31 +323,31 @@ class Quadrature:
         np.add.at(at_nodes, nodes, np.concatenate([values * volumes, volumes], axis=-1))
         sums.scatter_reverse(dolfinx.la.InsertMode.add)
         sums.scatter_forward()
-        return np.asarray(at_nodes[nodes, :-1] / at_nodes[nodes, -1:])
+        return at_nodes[nodes, :-1] / at_nodes[nodes, -1:]
 
-    def maximum(self, values: NDArray[np.float64]) -> float:
+    def maximum(self, values: Array) -> float:
         """Return the largest of values (elements, ...) over all ranks. Collective."""
         local = float(np.max(self.owned(values), initial=-np.inf))
         return float(allreduce(self.mesh.comm, local, MPI.MAX))
 
-    def argmax_position(self, values: NDArray[np.float64]) -> tuple[float, float, float]:
+    def argmax_position(self, values: Array) -> tuple[float, float, float]:
         """Return the reference position of the largest of values (elements, points). Collective."""
         owned = self.owned(values)
-        local: tuple[float, tuple[float, float, float]] = (-np.inf, (np.nan, np.nan, np.nan))
+        local = (-np.inf, (np.nan, np.nan, np.nan))
         if owned.size:
             at = np.unravel_index(int(np.argmax(owned)), owned.shape)
             local = (float(owned[at]), tuple(self.coordinates[at].tolist()))
         return max(allgather(self.mesh.comm, local), key=lambda largest: largest[0])[1]
 
-    def shown_place_of_largest(self, values: NDArray[np.float64]) -> str:
+    def shown_place_of_largest(self, values: Array) -> str:
         """Return the reference position of the largest value as text. Collective."""
         return f"({', '.join(f'{c:.4g}' for c in self.argmax_position(values))})"
 
-    def minimum(self, values: NDArray[np.float64]) -> float:
+    def minimum(self, values: Array) -> float:
         """Return the smallest of values (elements, ...) over all ranks. Collective."""
         return -self.maximum(-values)
 
-    def norm(self, values: NDArray[np.float64]) -> float:
+    def norm(self, values: Array) -> float:
         """Return the root of the sum of squares of values (elements, ...). Collective."""
         return float(
             np.sqrt(self.mesh.comm.allreduce(float(np.sum(self.owned(values) ** 2)), MPI.SUM))

@@ -118,7 +118,7 @@ REMOVED = {"exact": "was removed; use 'lagged', or 'direct' for a new tangent in
 # By CHOLMOD, and by MUMPS.
 DEFINITE, SYMMETRIC = "Cholesky factorisation", "LDL^T factorisation"
 GENERAL = "LU factorisation"
-FACTOR_OPTIONS: dict[str, Mapping[str, object]] = {
+FACTOR_OPTIONS = {
     DEFINITE: {
         "pc_type": "cholesky",
         "pc_factor_mat_solver_type": "cholmod",

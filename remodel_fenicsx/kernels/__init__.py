@@ -30,7 +30,7 @@ from typing import Any
 
 import numpy as np
 from mpi4py import MPI
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from remodel_fenicsx.fem import jit
 from remodel_fenicsx.model import cells, energy, spectral, tensor_law, tensors
@@ -38,12 +38,11 @@ from remodel_fenicsx.model.cells import UnitCell
 from remodel_fenicsx.model.drivers import corotational_tensor
 from remodel_fenicsx.model.energy import Tissue
 from remodel_fenicsx.model.laws import Drive
+from remodel_fenicsx.model.tensors import Array, Flags
 from remodel_fenicsx.system import NOTICE, environment
 
 log = logging.getLogger(__name__)
 
-Array = NDArray[np.float64]
-Flags = NDArray[np.bool_]
 
 FOLDER = Path(__file__).parent
 NOT_FINITE = 2  # flag of a point with NaN or infinity
@@ -145,7 +144,7 @@ class PointKernels:
 
     def squared_length(self, F: Array, cell: UnitCell) -> Array:
         """Return `energy.squared_end_to_end_length` of one whole cell, (n,)."""
-        return np.asarray(energy.squared_end_to_end_length(F, [cell]))
+        return energy.squared_end_to_end_length(F, [cell])
 
 
 class CompiledPointKernels(PointKernels):

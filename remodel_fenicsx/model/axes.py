@@ -6,12 +6,11 @@ from collections.abc import Callable, Mapping
 from functools import cached_property
 
 import numpy as np
-from numpy.typing import NDArray
 
 from remodel_fenicsx.model.cells import components_first, cylindrical_axes, global_axes
 from remodel_fenicsx.model.spectral import principal
+from remodel_fenicsx.model.tensors import Array, Flags
 
-Array = NDArray[np.float64]
 Maker = Callable[[], Array]
 
 # name of a measured quantity: allowed numbers of columns
@@ -95,7 +94,7 @@ class LocalAxes:
         station: Maker,
         nodal_depth: Maker,
         thickness: Array | None = None,
-        undefined: NDArray[np.bool_] | None = None,
+        undefined: Flags | None = None,
     ):
         self.coordinates = coordinates
         self.thickness, self.undefined = thickness, undefined
@@ -210,7 +209,7 @@ def fibres_problem(measured: Mapping[str, Array]) -> str | None:
     return None
 
 
-def _row(name: str, valid: NDArray[np.bool_] | np.bool_, problem: str) -> str:
+def _row(name: str, valid: Flags | np.bool_, problem: str) -> str:
     return f"{name} of row {int(np.argmin(valid)) + 1} {problem}"
 
 

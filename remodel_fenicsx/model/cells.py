@@ -5,14 +5,12 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from remodel_fenicsx._lazy import Late
 from remodel_fenicsx.model.chains import UflOrArray
-from remodel_fenicsx.model.tensors import is_array
+from remodel_fenicsx.model.tensors import is_array, Array
 
 ufl = Late("ufl")
-Array = NDArray[np.float64]
 
 
 class UnitCell(NamedTuple):
@@ -81,8 +79,7 @@ def global_axes(coordinates: Array) -> Array:
 def turned_about_z(axes: Array, angle: float) -> Array:
     """Return axes as rows (..., 3, 3), turned about z from x towards y by an angle in degrees."""
     x = np.exp(1j * np.radians(angle))
-    turned: Array = axes @ [[x.real, x.imag, 0.0], [-x.imag, x.real, 0.0], [0.0, 0.0, 1.0]]
-    return turned
+    return axes @ [[x.real, x.imag, 0.0], [-x.imag, x.real, 0.0], [0.0, 0.0, 1.0]]
 
 
 def cylindrical_axes(coordinates: Array) -> Array:

@@ -6,15 +6,14 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from remodel_fenicsx._lazy import Late
 from remodel_fenicsx.model import tensors
 from remodel_fenicsx.model.chains import UflOrArray
 from remodel_fenicsx.model.energy import Stresses
+from remodel_fenicsx.model.tensors import Array
 
 ufl = Late("ufl")
-Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True)

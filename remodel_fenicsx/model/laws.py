@@ -16,7 +16,6 @@ from functools import partial
 from typing import NamedTuple, Protocol
 
 import numpy as np
-from numpy.typing import NDArray
 
 from remodel_fenicsx._renamed import with_old_arguments, with_old_names
 from remodel_fenicsx.model import spectral, tensor_law
@@ -25,8 +24,8 @@ from remodel_fenicsx.model.chains import NO_PARAMETERS, NO_VALUES, Formula, Para
 from remodel_fenicsx.model.drivers import Driver, Frame, convected_axes
 from remodel_fenicsx.model.energy import Tissue
 from remodel_fenicsx.model.tensor_law import Target
+from remodel_fenicsx.model.tensors import Array, Flags
 
-Array = NDArray[np.float64]
 Tension = Callable[[UflOrArray], UflOrArray]
 RankedFunction = Callable[[Array, Array, Array, Array | float, float, float], Array]
 Weights = Sequence[float]
@@ -42,7 +41,7 @@ class PrincipalKernels(Protocol):
     def principal(self) -> spectral.Pairing: ...
 
     @property
-    def positive_direction(self) -> Formula[tuple[Array, NDArray[np.bool_]]]: ...
+    def positive_direction(self) -> Formula[tuple[Array, Flags]]: ...
 
 
 class Drive(NamedTuple):

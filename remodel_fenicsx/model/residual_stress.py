@@ -57,11 +57,11 @@ class Panels:
         slopes = np.stack(
             [chebyshev.chebval(points, chebyshev.chebder(unit)) for unit in ones], axis=-1
         )
-        self._slope: Array = slopes @ self._coefficients
+        self._slope = slopes @ self._coefficients
         areas = np.array(
             [chebyshev.chebval(1.0, chebyshev.chebint(unit, lbnd=-1)) for unit in ones]
         )
-        self._weights: Array = areas @ self._coefficients
+        self._weights = areas @ self._coefficients
 
     def derivative(self, values: Array) -> Array:
         """Return the radial derivative of values (..., panels, points)."""
@@ -456,7 +456,7 @@ def means_through(
     bounds = (edges[1:-1] ** 2 - edges[0] ** 2) / (edges[-1] ** 2 - edges[0] ** 2)
     ring = np.unique(np.searchsorted(bounds, inside / volumes.sum()), return_inverse=True)[1]
     columns = (np.ones_like(radius), *values.T)
-    sums: list[Array] = [
+    sums = [
         np.bincount(ring, volumes[order] * column[order]).astype(np.float64) for column in columns
     ]
     return sums[0], np.stack(sums[1:], axis=-1) / sums[0][:, None]

@@ -11,9 +11,8 @@ import numpy as np
 import numpy.typing as npt
 
 from remodel_fenicsx.model.chains import Formula
+from remodel_fenicsx.model.tensors import Array, Flags
 
-Array = npt.NDArray[np.float64]
-Flags = npt.NDArray[np.bool_]
 
 ROUNDING = 64 * float(np.finfo(np.float64).eps)
 """Relative size below which a principal value is rounding error (eigh is accurate to a few eps)."""
@@ -123,7 +122,7 @@ PAIRINGS: dict[str, Pairing] = {"sorted": principal, "continuous": principal_by_
 
 def positive_direction(
     values: npt.ArrayLike, threshold: npt.ArrayLike = 0.0
-) -> tuple[Array, npt.NDArray[np.bool_]]:
+) -> tuple[Array, Flags]:
     """Return e = lambda^+ / |lambda^+| (eqs. 9 to 11), and the points with a positive value."""
     values = np.asarray(values, dtype=np.float64)
     _require_finite(values, "set of principal values")

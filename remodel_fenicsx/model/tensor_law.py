@@ -12,9 +12,8 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
-Array = NDArray[np.float64]
+from remodel_fenicsx.model.tensors import Array, Flags
 
 COMPRESSION = 0.01
 """Weight of the squared compression against the squared tension. The switch is one half if
@@ -53,7 +52,7 @@ class Target(NamedTuple):
         direction = changed / np.where(active, switch, 1.0)[:, None, None]
         return Target(direction, np.where(active, np.minimum(switch, 1.0), 0.0))
 
-    def where(self, chosen: NDArray[np.bool_], other: Target) -> Target:
+    def where(self, chosen: Flags, other: Target) -> Target:
         """Return the target, replaced by `other` at the chosen points."""
         return Target(
             np.where(chosen[:, None, None], other.direction, self.direction),
@@ -103,5 +102,5 @@ def relax_exactly(
     """Return A after a time with a constant target; exact."""
     squared = np.reshape(np.asarray(end_to_end_length, dtype=np.float64) ** 2, (-1, 1, 1))
     weight = -np.expm1(-kappa_dt * towards.switch)[:, None, None]
-    change: Array = weight * (squared * towards.direction - structure)
+    change = weight * (squared * towards.direction - structure)
     return structure + change

@@ -23,10 +23,10 @@ from remodel_fenicsx.fem import compat, jit
 from remodel_fenicsx.fem.assembly import integral, allreduce
 from remodel_fenicsx.fem.quadrature import Quadrature
 from remodel_fenicsx.model.drivers import DRIVERS
+from remodel_fenicsx.model.tensors import Array, Flags
 from remodel_fenicsx.schema.tables import SceneError, format_value
 from remodel_fenicsx.solver.equilibrium import Equilibrium, PointStresses
 
-Array = NDArray[np.float64]
 T = TypeVar("T")
 NO_LUMEN = 1e-9  # of the body's size cubed: a flat inner face encloses that by rounding
 
@@ -255,14 +255,12 @@ class Measurement:
         """r/L at all points (elements, points); 0 where no chain locks."""
         cells, F = self.state.cells, self.state.elastic_gradient()
         length = self.equilibrium.parameters.locking_length()
-        return np.asarray(
-            np.sqrt(cells.kernels.squared_length(F, cells.point_cells)).reshape(length.shape)
-            / length
-        )
+        squared = cells.kernels.squared_length(F, cells.point_cells).reshape(length.shape)
+        return np.sqrt(squared) / length
 
-    def elements_of_region(self, name: str) -> NDArray[np.bool_]:
+    def elements_of_region(self, name: str) -> Flags:
         """Return a mask of the local elements of a region, (elements,)."""
-        return np.asarray(self.domain.element_region == self.domain.regions[name])
+        return self.domain.element_region == self.domain.regions[name]
 
     @cached_property
     def axial_stretch(self) -> Array:
@@ -353,10 +351,10 @@ class Measurement:
         """
         return self.quadrature.minimum(values)
 
-    def elements_touching_radius(self, radius: float) -> NDArray[np.bool_]:
+    def elements_touching_radius(self, radius: float) -> Flags:
         """Return a mask of the local elements at a radius from the z axis, (elements,)."""
 
-        def touch() -> NDArray[np.bool_]:
+        def touch() -> Flags:
             mesh = self.domain.mesh
             nodes = mesh.geometry.x[compat.geometry_dofmap(mesh)]
             radii, tolerance = np.linalg.norm(nodes[..., :2], axis=-1), 1e-6 * self.domain.size
@@ -405,7 +403,7 @@ def _face_form(
     """Make a nodal field, and its integral over the reference or deformed area of a face."""
     state, mesh = measured.state, measured.domain.mesh
     # first component of a function of the displacement's space, which has the same order of nodes
-    field: dolfinx.fem.Function = dolfinx.fem.Function(state.kinematics.nodal_space(state.unknown))
+    field = dolfinx.fem.Function(state.kinematics.nodal_space(state.unknown))
     value, normal = field[0] if field.ufl_shape else field, ufl.FacetNormal(mesh)
     F = state.kinematics.deformation_gradient(state.unknown)
     stretched = ufl.cofac(F) * normal if deformed else normal
@@ -493,7 +491,7 @@ def _end_forms(measured: Measurement, face: str) -> list[list[dolfinx.fem.Form]]
     tissue, elastic = state.kinematics.stress_free_weight(mesh), state.kinematics.elastic
     # a function in place of a number: UFL differentiates by functions only, and some kinematics
     # prescribe F_zz
-    change: dolfinx.fem.Function = dolfinx.fem.Function(dolfinx.fem.functionspace(mesh, ("DG", 0)))
+    change = dolfinx.fem.Function(dolfinx.fem.functionspace(mesh, ("DG", 0)))
     one, size = (
         dolfinx.fem.Constant(mesh, np.float64(v))
         for v in (1.0, measured.domain.dimensions["length"])

@@ -19,6 +19,7 @@ from remodel_fenicsx.fem.kinematics import KINEMATICS
 from remodel_fenicsx.model.axes import GROWTH, NATURAL_GRADIENT
 from remodel_fenicsx.model.cells import structure_tensor
 from remodel_fenicsx.model.energy import TURNED_OVER
+from remodel_fenicsx.model.tensors import Array, Integers
 from remodel_fenicsx.results.recording import RecordedRun, RecordingError, unit_of
 from remodel_fenicsx.results.whole_body import AXIS_FIELDS, WholeBody
 from remodel_fenicsx.schema.settings import OnFace, Support, faces_of
@@ -33,7 +34,7 @@ LEAST_SAID = 0.01  # change between elements: a fit of angles does not resolve l
 def write_vtu(
     path: Path,
     points: ArrayLike,
-    cells: NDArray[np.int64],
+    cells: Integers,
     cell_type: int,
     cell_data: Mapping[str, ArrayLike],
     point_data: Mapping[str, ArrayLike] | None = None,
@@ -56,7 +57,6 @@ def write_vtu(
 # other programs (programs.toml) have regions, faces, supports and pressures too, for which the
 # body is meshed again; other formats need no dolfinx.
 
-Array = NDArray[np.float64]
 
 TENSOR_COMPONENTS = tuple(f"{i}{j}" for i in "xyz" for j in "xyz")  # of a tensor, row by row
 
@@ -70,7 +70,7 @@ class Fibres:
     """The mean cells of the elements of a body."""
 
     points: Array
-    elements: NDArray[np.int64]
+    elements: Integers
     dimensions: Array
     axes: Array
     displacement: Array | None
@@ -83,7 +83,7 @@ class Fibres:
         return structure_tensor(self.dimensions, self.axes)
 
     @property
-    def reduced(self) -> NDArray[np.int64]:
+    def reduced(self) -> Integers:
         """Elements with the nodes that other programs use."""
         # They count nodes within faces in other orders, and CalculiX has no such element.
         return self.elements[:, :20]
@@ -118,7 +118,7 @@ def export(
     return path
 
 
-def unevenness(elements: NDArray[np.int64], tensors: Array) -> float:
+def unevenness(elements: Integers, tensors: Array) -> float:
     """Compute the largest change of A (elements, 3, 3), relative to tr A, at the nodes.
 
     It is the change from an element to the mean of all elements at one of its nodes.

@@ -16,9 +16,9 @@ from pathlib import Path
 from typing import Any, TYPE_CHECKING
 
 import numpy as np
-from numpy.typing import NDArray
 
 from remodel_fenicsx.errors import RemodelError
+from remodel_fenicsx.model.tensors import Array, Integers
 from remodel_fenicsx.system.environment import check_extensions
 from remodel_fenicsx.system.files import (
     LOCK,
@@ -64,15 +64,11 @@ VIEWS = {"front": (0.3, -1.0, 0.42), "above": (0.0, -0.02, 1.0)}
 
 # ---------------------------------------------------------------- times to show
 
-Numbers = NDArray[np.float64]
 
-
-def kept_times(times: Numbers, most: int) -> Numbers:
+def kept_times(times: Array, most: int) -> Array:
     """Select at most `most` recorded times, evenly spaced, with the first and the last."""
     return times[np.unique(np.linspace(0, len(times) - 1, most).round().astype(int))]
 
-
-Array = NDArray[np.float64]
 
 HISTORY = "history.csv"
 FIELDS, CHAIN_LINES = "fields.vtkhdf", "fields_chains.vtkhdf"
@@ -214,7 +210,7 @@ class RecordedRun:
             return _block(root["Points"], 0, int(root["NumberOfPoints"][0]))
 
     @cached_property
-    def elements(self) -> NDArray[np.int64]:
+    def elements(self) -> Integers:
         """Numbers of the nodes of each element in VTK's order, (elements, nodes of one).
 
         Raises

@@ -12,7 +12,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager, nullcontext, suppress
 from pathlib import Path
 from types import MappingProxyType
-from typing import NamedTuple, cast
+from typing import NamedTuple
 
 from mpi4py import MPI
 
@@ -85,7 +85,7 @@ def chosen_folder(requested: Path | str | None, name: str, comm: MPI.Intracomm) 
     chosen = raise_on_all_ranks(
         comm, lambda: choose_folder(wanted, name) if comm.rank == 0 else None
     )
-    return cast(Path, comm.bcast(chosen))
+    return comm.bcast(chosen)
 
 
 @contextmanager

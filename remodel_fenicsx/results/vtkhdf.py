@@ -252,7 +252,7 @@ def vtk_cells(
     from dolfinx import cpp
     from dolfinx.mesh import to_type
 
-    from_vtk = np.asarray(cpp.io.perm_vtk(to_type(cell_name), elements.shape[1]))
+    from_vtk = cpp.io.perm_vtk(to_type(cell_name), elements.shape[1])
     return CELL_TYPES[cell_name][degree > 1], elements[:, np.argsort(from_vtk)]
 
 

@@ -7,18 +7,16 @@ from contextlib import ExitStack
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
 from remodel_fenicsx._lazy import Late
 from remodel_fenicsx.body.reductions import Turn
 from remodel_fenicsx.fem.kinematics import KINEMATICS
 from remodel_fenicsx.model.axes import NATURAL_GRADIENT
+from remodel_fenicsx.model.tensors import Array, Integers
 from remodel_fenicsx.results.recording import RecordedRun, RecordingError
 from remodel_fenicsx.results.vtkhdf import CELL_TYPES, LINE, TransientGrid
 
 spatial = Late("scipy.spatial")  # most runs show no reduction
-Array = NDArray[np.float64]
-Numbers = NDArray[np.int64]
 Fields = tuple[Array | None, dict[str, Array]]
 
 CORNERS = {"interval": 2, "quadrilateral": 4, "tetrahedron": 4, "hexahedron": 8}
@@ -37,7 +35,12 @@ class RotatedFields:
     """Map from the nodes and elements of a whole body to those of its reduction, with fields."""
 
     def __init__(
-        self, points: Array, elements: Numbers, own_points: Array, own_elements: Numbers, turn: Turn
+        self,
+        points: Array,
+        elements: Integers,
+        own_points: Array,
+        own_elements: Integers,
+        turn: Turn,
     ):
         self.turns = turn(points)
         back = np.einsum("nji,nj->ni", self.turns, points)  # Q^T X
@@ -81,7 +84,9 @@ AXIS_FIELDS = ("axis_1", "axis_2", "axis_3")
 OF_CHAINS = ("cell_dimensions", *AXIS_FIELDS, "deformation_gradient", "fibre_angle")
 
 
-def chain_lines(centres: Array, lengths: Array, axes: Array, scale: float) -> tuple[Array, Numbers]:
+def chain_lines(
+    centres: Array, lengths: Array, axes: Array, scale: float
+) -> tuple[Array, Integers]:
     """Return the chains of unit cells, +-l_1 n_1 +-l_2 n_2 +-l_3 n_3 (paper, Fig. 2)."""
     signs = np.array([(1.0, 1, 1), (1, 1, -1), (1, -1, 1), (1, -1, -1)])
     half = scale * signs @ (lengths[:, :, None] * axes)
@@ -102,7 +107,7 @@ def append_chains(
     grid: TransientGrid | Path,
     time: float,
     points: Array,
-    elements: Numbers,
+    elements: Integers,
     scale: float,
     displacement: Array,
     fields: Mapping[str, Array],
@@ -167,7 +172,7 @@ class WholeBody:
         )
         return None if displacement is None else displacement[self._used], of_elements
 
-    def means(self, values: Sequence[Array], part: Numbers | int = 0, parts: int = 1) -> Array:
+    def means(self, values: Sequence[Array], part: Integers | int = 0, parts: int = 1) -> Array:
         """Return volume means of the layers, or of sectors of each, (layers sectors, values)."""
         bins, number = parts * self.layer + part, parts * len(self.depth)
         weighted = [self.volume * one for one in (*values, np.ones_like(self.volume))]
@@ -195,10 +200,10 @@ def _volumes(corners: Array) -> Array:
         grid = corners[:, [0, 1, 3, 2, 4, 5, 7, 6]].reshape(-1, 2, 2, 2, 3)
         sides = np.stack([np.diff(grid, axis=k).mean(axis=(1, 2, 3)) for k in (1, 2, 3)], axis=1)
     total = np.abs(np.linalg.det(sides))
-    return np.asarray(total / total.sum())
+    return total / total.sum()
 
 
-def _layers(depth: Array, elements: Numbers) -> tuple[Numbers, Array]:
+def _layers(depth: Array, elements: Integers) -> tuple[Integers, Array]:
     """Return each element's layer and the layers' mean depths: of the mesh, or equal intervals."""
     nodes = np.bincount(
         elements.ravel(), weights=np.repeat(depth, elements.shape[1])

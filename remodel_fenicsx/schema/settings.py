@@ -16,7 +16,6 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Annotated, Any, Literal, NamedTuple, NoReturn, Optional, get_args
 
 import numpy as np
-from numpy.typing import NDArray
 from pydantic import (
     AfterValidator,
     ConfigDict,
@@ -45,6 +44,7 @@ from remodel_fenicsx.model.drivers import DRIVERS, FRAMES
 from remodel_fenicsx.model.energy import ELASTIN, MATRICES, Matrix, REPULSIONS, TURNED_OVER, Tissue
 from remodel_fenicsx.model.laws import LAWS, MEANS_OF_CASES
 from remodel_fenicsx.model.spectral import PAIRINGS
+from remodel_fenicsx.model.tensors import Array
 from remodel_fenicsx.schema import processes
 from remodel_fenicsx.schema.processes import ProcessTable
 from remodel_fenicsx.schema.tables import (
@@ -548,7 +548,7 @@ class Cells(Table):
         r0 = format_value(self.end_to_end_length)
         return f"root of the sum of squares is {length:.7g}; must be cells.end_to_end_length = {r0}"
 
-    def dimensions(self, number_of_elements: int) -> NDArray[np.float64]:
+    def dimensions(self, number_of_elements: int) -> Array:
         """Return l_I at t = 0 of every element of the mesh file, in link lengths.
 
         The result has shape (number_of_elements, 3). Every rank draws the complete list of random

@@ -11,7 +11,6 @@ from functools import partial
 import dolfinx.fem
 import numpy as np
 from mpi4py import MPI
-from numpy.typing import NDArray
 from petsc4py import PETSc
 
 from remodel_fenicsx.errors import RemodelError, SOLVE_FAILED
@@ -19,6 +18,7 @@ from remodel_fenicsx.fem.assembly import allreduce
 from remodel_fenicsx.model.cells import UnitCell
 from remodel_fenicsx.model.chains import UflOrArray
 from remodel_fenicsx.model.energy import Tissue
+from remodel_fenicsx.model.tensors import Array
 from remodel_fenicsx.schema.settings import Solver
 from remodel_fenicsx.solver.equilibrium import Equilibrium, StateLimits
 from remodel_fenicsx.solver.newton import (
@@ -168,7 +168,7 @@ class Continuation:
     loose_tolerance: bool = False
     refusal: FailureCause | None = field(default=None, init=False)  # cause of a jump in the change
     # Rate of the unknowns in the last substep.
-    _direction: NDArray[np.float64] | None = field(default=None, init=False)
+    _direction: Array | None = field(default=None, init=False)
 
     @functools.cached_property
     def newton(self) -> GuardedNewton:
@@ -226,7 +226,7 @@ class Continuation:
                 part *= 2
                 work.substeps += 1
 
-    def check_for_jump(self, before: NDArray[np.float64], work: Work, again: bool) -> bool:
+    def check_for_jump(self, before: Array, work: Work, again: bool) -> bool:
         """Repeat a step in substeps if it may have jumped. Return True if so. Collective."""
         # `again`: the same step was solved before, with other cells.
         vector, last = self.state.unknown.x, self.state.numbers.get(LAST_CHANGE, 0.0)
@@ -241,7 +241,7 @@ class Continuation:
         self.state.numbers[LAST_CHANGE] = max(moved, last) if again else moved
         return looked
 
-    def repeat_in_substeps(self, before: NDArray[np.float64], work: Work) -> None:
+    def repeat_in_substeps(self, before: Array, work: Work) -> None:
         """Repeat a step in substeps from the unknowns before it. Collective."""
         # The solution stays if the substeps fail, with a warning if the branch ends there. If they
         # lead to another solution, that one is used, because the body reaches it.
@@ -293,7 +293,7 @@ class Continuation:
             0.0 < solution.displacement_ratio < CLOSE and solution.newton_iterations > MANY
         )
 
-    def _size(self, change: NDArray[np.float64]) -> float:
+    def _size(self, change: Array) -> float:
         """Return the largest change of an unknown over all ranks. Collective."""
         return float(allreduce(self.state.comm, float(np.abs(change).max(initial=0.0)), MPI.MAX))
 
@@ -303,7 +303,7 @@ class Continuation:
         jumps = self.state.numbers.get(JUMPS_SO_FAR, 0.0)
         return enough and self.refusal is None and jumps < MOST_JUMPS
 
-    def _warn_of_jump(self, solved: NDArray[np.float64], refusal: FailureCause) -> None:
+    def _warn_of_jump(self, solved: Array, refusal: FailureCause) -> None:
         """Warn of a jump from the end of a branch, the present state, to `solved`. Collective."""
         self.refusal = refusal
         state, vector = self.state, self.state.unknown.x

@@ -8,15 +8,14 @@ from dataclasses import dataclass, replace
 import dolfinx.fem
 import numpy as np
 from mpi4py import MPI
-from numpy.typing import NDArray
 from petsc4py import PETSc
 
+from remodel_fenicsx.model.tensors import Array
 from remodel_fenicsx.solver.equilibrium import Equilibrium
 from remodel_fenicsx.solver.linear import LaggedFactorisation, fill_asymmetric
 from remodel_fenicsx.solver.newton import GuardedNewton, SolveFailure
 
 log = logging.getLogger(__name__)
-Array = NDArray[np.float64]
 
 
 # ---------------------------------------------------------------- inertia of the tangent
@@ -300,7 +299,7 @@ UNSTABLE = FailureCause(
 def diagnose_failure(
     newton: GuardedNewton,
     failure: SolveFailure | None,
-    direction: NDArray[np.float64] | None = None,
+    direction: Array | None = None,
 ) -> FailureCause:
     """Return the cause of a failure, from the last solved state. Collective."""
     limits = newton.equilibrium.limits()
@@ -351,7 +350,7 @@ def _of_the_tolerance(failure: SolveFailure) -> FailureCause | None:
     return replace(cause, advice=f"{cause.advice}; {key} would accept this state")
 
 
-def _of_the_tangent(inertia: Inertia, direction: NDArray[np.float64] | None) -> FailureCause:
+def _of_the_tangent(inertia: Inertia, direction: Array | None) -> FailureCause:
     negative, mode = inertia.negative_eigenvalues(), inertia.lowest()
     at_start, unloaded = inertia_without_loads(inertia)
     place = ", ".join(f"{c:.4g}" for c in mode.place)

@@ -11,7 +11,6 @@ import dolfinx.fem.petsc
 import numpy as np
 import ufl
 from mpi4py import MPI
-from numpy.typing import NDArray
 from petsc4py import PETSc
 
 from remodel_fenicsx.fem import jit
@@ -31,14 +30,13 @@ from remodel_fenicsx.model.energy import (
     squared_end_to_end_length,
     total_structure_tensor,
 )
-from remodel_fenicsx.model.tensors import MANDEL, det, determinant_changes_sign
+from remodel_fenicsx.model.tensors import MANDEL, det, determinant_changes_sign, Array
 from remodel_fenicsx.state import State
 
 if TYPE_CHECKING:
     from dolfinx.fem import Function
     from ufl.core.expr import Expr
 
-Array = NDArray[np.float64]
 Shares = Callable[[], Sequence[UnitCell]]
 
 
@@ -304,7 +302,7 @@ class Equilibrium:
         F, cells = self.state.elastic_gradient(), self.state.cells
         if self._point_shares is None:
             return cells.kernels.squared_length(F, cells.point_cells).reshape(shape)
-        return np.asarray(squared_end_to_end_length(F, self._point_shares())).reshape(shape)
+        return squared_end_to_end_length(F, self._point_shares()).reshape(shape)
 
     def stored_energy(self) -> float:
         """Return the integral of W over the body. Collective."""
@@ -359,7 +357,7 @@ class Equilibrium:
         if self.pointwise is not None:
             self.pointwise.update(stiffness=True)
 
-    def prescribed_values(self) -> NDArray[np.float64]:
+    def prescribed_values(self) -> Array:
         """Return prescribed values of this rank's unknowns with ghosts; NaN for free unknowns."""
         vector = self.state.unknown.x
         values = np.full_like(vector.array, np.nan)

@@ -11,7 +11,6 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 from mpi4py import MPI
-from numpy.typing import NDArray
 from petsc4py import PETSc
 
 from remodel_fenicsx._renamed import with_old_names
@@ -29,13 +28,12 @@ from remodel_fenicsx.fem.solver_methods import (
     SYMMETRIC,
     factor_options,
 )
+from remodel_fenicsx.model.tensors import Array
 from remodel_fenicsx.solver.equilibrium import Equilibrium
 
 if TYPE_CHECKING:
     from mpi4py.MPI import Comm
     from petsc4py.PETSc import Mat, PC, SNES, Vec
-
-Array = NDArray[np.float64]
 
 
 # ---------------------------------------------------------------- quasi-Newton steps
@@ -466,7 +464,7 @@ def cheaper_method(equilibrium: Equilibrium) -> str:
         size / 1e9,
         memory / 1e9,
     )
-    return str(allreduce(equilibrium.comm, method, MPI.MAX))
+    return allreduce(equilibrium.comm, method, MPI.MAX)
 
 
 class Lagged(FullNewton):

@@ -11,7 +11,6 @@ from typing import TypeVar
 import dolfinx.fem.petsc
 import numpy as np
 from mpi4py import MPI
-from numpy.typing import NDArray
 from petsc4py import PETSc
 
 from remodel_fenicsx.fem.assembly import allreduce
@@ -24,6 +23,7 @@ from remodel_fenicsx.fem.solver_methods import (
     is_small,
     method_options,
 )
+from remodel_fenicsx.model.tensors import Array
 from remodel_fenicsx.schema.settings import Solver
 from remodel_fenicsx.solver.attempts import WITH_FALLBACK, say
 from remodel_fenicsx.solver.equilibrium import Equilibrium, StateLimits, PointState
@@ -32,7 +32,6 @@ from remodel_fenicsx.state import stress_rounding
 from remodel_fenicsx.system.interrupts import Interrupted
 
 log = logging.getLogger(__name__)
-Array = NDArray[np.float64]
 T = TypeVar("T")
 F = TypeVar("F", bound=Exception)
 

@@ -19,7 +19,6 @@ from typing import TYPE_CHECKING, Annotated, Literal
 import numpy as np
 from matplotlib.figure import Figure
 from mpi4py import MPI
-from numpy.typing import NDArray
 from pydantic import Field, model_validator
 
 from remodel_fenicsx._version import __version__
@@ -45,6 +44,7 @@ from remodel_fenicsx.schema.units import (
     scene_units,
 )
 from remodel_fenicsx.initial import resolve_auto_settings
+from remodel_fenicsx.model.tensors import Array, Integers
 from remodel_fenicsx.simulation import Simulation, reset_simulation
 from remodel_fenicsx.solver.continuation import StepFailure
 from remodel_fenicsx.state import Snapshot
@@ -71,14 +71,12 @@ if TYPE_CHECKING:
 
 log = logging.getLogger(__name__)
 
-Array = NDArray[np.float64]
-Integers = NDArray[np.int64]
 Columns = dict[str, Array]
 
 
 # ---------------------------------------------------------------- data, checked before any solve
 LARGEST_TABLE = 10**7  # bytes: a hundred thousand rows
-DIMENSIONS = {"stress": STRESS, "length": LENGTH, "stress * length^2": FORCE, "force": FORCE}
+DIMENSIONS = {"stress": STRESS, "length": LENGTH, "force": FORCE}
 PROTOCOL = "protocol"  # the column of labels of protocols
 NOT_MEASURED = set(
     (
@@ -1092,7 +1090,7 @@ class Fit(StudyResult):
     @property
     def correlations(self) -> Array:
         """Correlation matrix of the logarithms, (n, n)."""
-        return np.asarray(self.covariance / np.outer(self.deviations, self.deviations))
+        return self.covariance / np.outer(self.deviations, self.deviations)
 
     @property
     def inflation(self) -> float:

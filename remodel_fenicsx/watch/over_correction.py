@@ -121,7 +121,7 @@ class OverCorrection(WarnsOnce):
             np.array(1 / (dolfinx.la.norm(vector) or 1.0)),
         )
         self.swings = {"growing": cells_swing, "sustained": body_swing}
-        tells, overshoots = self._is_pass_oscillation(step, cells, times), False
+        tells, overshoots = self._is_pass_oscillation(cells, times), False
         for (name, swing), (factor, passes) in zip(
             self.swings.items(), (GROWING, SUSTAINED), strict=True
         ):
@@ -152,7 +152,7 @@ class OverCorrection(WarnsOnce):
             np.sqrt(products[0, 0]) / GAIN, products[0, 1] / (products[1, 1] or np.inf)
         )
 
-    def _is_pass_oscillation(self, step: Step, cells: Array, times: Array) -> bool:
+    def _is_pass_oscillation(self, cells: Array, times: Array) -> bool:
         """Return whether passes oscillate, not loads, unequal steps or delays. Collective."""
         # At time 0 there are no loads.
         loads = np.array([[*self.stepper.load_values(time).values()] for time in times]) * (

@@ -8,10 +8,10 @@ from functools import cached_property
 from typing import TYPE_CHECKING
 
 import numpy as np
-from numpy.typing import NDArray
 
 from remodel_fenicsx.body.reductions import Strut
 from remodel_fenicsx.evolution.stepper import LoadCaseSolver, Step, Stepper, WarnsOnce, Watcher
+from remodel_fenicsx.model.tensors import Array
 from remodel_fenicsx.solver.continuation import StepFailure
 from remodel_fenicsx.solver.diagnosis import (
     FactorisationFailed,
@@ -29,7 +29,6 @@ if TYPE_CHECKING:
     from remodel_fenicsx.scene.scene import Scene
 
 log = logging.getLogger(__name__)
-Array = NDArray[np.float64]
 
 # Number of Newton iterations with a tangent between two counts. A count costs about as much as an
 # iteration.

@@ -7,18 +7,16 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import dolfinx.fem
 import numpy as np
-from numpy.typing import NDArray
 
 from remodel_fenicsx.body.shape import Shape
 from remodel_fenicsx.evolution.stepper import Step, Stepper, WarnsOnce
 from remodel_fenicsx.fem.compat import geometry_dofmap
 from remodel_fenicsx.fem.formulations import FORMULATIONS, NOT_LOCKING, STIFF_BULK
+from remodel_fenicsx.model.tensors import Array
 from remodel_fenicsx.system import NOTICE
 
 if TYPE_CHECKING:
     from remodel_fenicsx.scene.scene import Scene
-
-Array = NDArray[np.float64]
 
 
 # ---------------------------------------------------------------- spurious stiffness
@@ -157,7 +155,7 @@ class LockingWarning(ElementWarning):
         shear = (self.stiffnesses[1] * weights).sum(axis=1) / weights.sum(axis=1)
         inside = (shape * weights).sum(axis=1) / weights.sum(axis=1)
         jumps = JUMPS * 2 * shear * quadrature.jumps(F)
-        return np.asarray(np.minimum(1.0, jumps / np.maximum(inside, np.finfo(float).tiny)))
+        return np.minimum(1.0, jumps / np.maximum(inside, np.finfo(float).tiny))
 
     def work(self) -> tuple[float, float]:
         """Return the linearised work of loads and supports, and of loads alone. Collective."""

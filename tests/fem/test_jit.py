@@ -30,7 +30,7 @@ x = ufl.SpatialCoordinate(mesh)
 value = dolfinx.fem.assemble_scalar(jit.form(x[0] ** 3 * ufl.dx, name="the moment"))
 total = mesh.comm.allreduce(value)
 assert abs(total - 0.25) < 1e-12, total
-print(len(jit.compiled_kernels()))
+print(len(jit.compiled_kernels))
 """
 
 
@@ -162,7 +162,7 @@ for _ in range(2):
     derivatives = ufl.as_vector([ufl.diff(value, first), ufl.diff(value, second)])
     compiled = jit.expression(derivatives, numpy.array([[0.5, 0.25, 0.0]]))
     numpy.testing.assert_allclose(quadrature.point_values(compiled, mesh, numpy.zeros(1, numpy.int32), 1)[0], [[1 / 64, 3 / 64]])
-print(len(jit.compiled_kernels()))
+print(len(jit.compiled_kernels))
 """
 
 

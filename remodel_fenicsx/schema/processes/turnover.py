@@ -7,13 +7,12 @@ from collections.abc import Iterator, Mapping
 from operator import methodcaller
 from typing import Annotated, Any, Literal
 
-import numpy as np
-from numpy.typing import NDArray
 from pydantic import AfterValidator, Field, GetPydanticSchema
 
 from remodel_fenicsx.model.axes import GROWTH
 from remodel_fenicsx.model.energy import TURNED_OVER, Tissue
 from remodel_fenicsx.model.laws import TURNOVER_RATES, TurnoverRule
+from remodel_fenicsx.model.tensors import Array
 from remodel_fenicsx.schema.processes import ProcessTable
 from remodel_fenicsx.schema.tables import Faults, OneOf, format_value, with_key
 
@@ -152,7 +151,7 @@ class Turnover(_WithStart, ProcessTable):  # type: ignore[misc]
             rule = f"must be smaller than {most}"
             yield rule, "remodeling.turnover.deposition_stretch", self.deposition_stretch
 
-    def initial_problem(self, changed: Mapping[str, NDArray[np.float64]]) -> str:
+    def initial_problem(self, changed: Mapping[str, Array]) -> str:
         names = [name for name in TURNED_OVER if name in changed]
         if names and not self.is_on:
             return f"has {' and '.join(names)}, which needs remodeling.turnover"
