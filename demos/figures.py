@@ -783,7 +783,9 @@ def draw_energy(runs: Runs, page: Page) -> None:
 
 # ---------------------------------------------------------------- which figures there are
 
-CHAINS_DRAWN = "Black: the four chains of each element's mean cell, deformed and projected on its face."
+CHAINS_DRAWN = (
+    "Black: the four chains of each element's mean cell, deformed and projected on its face."
+)
 PEELED = "the outer layers of elements cut shorter than the inner ones"
 WALL = "coloured by the deformed angle of the chains in the wall"
 PROFILE = "Reference fibre angle over the radius at t = 150; lines: means of the element layers, bands: all elements"
