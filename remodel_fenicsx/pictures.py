@@ -120,13 +120,13 @@ def chains(body: pyvista.UnstructuredGrid) -> pyvista.PolyData:
     surface = body.extract_surface().compute_normals(point_normals=False, split_vertices=False)
     faces = surface.faces.reshape(surface.n_cells, -1)[:, 1:]
     corners = surface.points[faces]
-    middle = corners.mean(axis=1)
+    middle = corners.mean(1)
     moved = surface.point_data.get("displacement", np.zeros((surface.n_points, 3)))
     reference = corners - moved[faces]
-    sides = (reference + np.roll(reference, 1, axis=1)) / 2 - reference.mean(axis=1, keepdims=True)
+    sides = (reference + np.roll(reference, 1, axis=1)) / 2 - reference.mean(1, keepdims=True)
     # Twice the undeformed distance from the middle of a face to its closest side.
-    size = 2 * np.linalg.norm(sides, axis=2).min(axis=1)
-    axes = np.stack([surface.cell_data[name] for name in AXIS_FIELDS], axis=1)
+    size = 2 * np.linalg.norm(sides, axis=2).min(1)
+    axes = np.stack([surface.cell_data[name] for name in AXIS_FIELDS], 1)
     lengths = surface.cell_data["cell_dimensions"]
     ends, lines = chain_lines(np.zeros_like(middle), lengths, axes, CHAIN_LOOK["reach"])
     gradient = surface.cell_data["deformation_gradient"].reshape(-1, 3, 3)
@@ -193,7 +193,7 @@ def main(file: str) -> None:
     """Draw the sheets of a job file and save the pictures next to it."""
     job = pickle.loads(Path(file).read_bytes())
     bounds = np.array([body.bounds for sheet in job.sheets for _, body in sheet]).reshape(-1, 3, 2)
-    extent = np.stack([bounds[..., 0].min(axis=0), bounds[..., 1].max(axis=0)], axis=1)
+    extent = np.stack([bounds[..., 0].min(0), bounds[..., 1].max(0)], 1)
     np.save(f"{file}.npy", [_drawn(job, sheet, extent) for sheet in job.sheets])
 
 
@@ -206,7 +206,7 @@ def _drawn(
     up = (0, 1, 0) if math.hypot(*job.direction[:2]) < 0.01 * abs(job.direction[2]) else (0, 0, 1)
     across = np.cross(up, job.direction)
     axes = np.array([across, np.cross(across, job.direction)])
-    seen = np.abs(axes) @ np.ptp(bounds, axis=1) / np.linalg.norm(axes, axis=1)
+    seen = np.abs(axes) @ np.ptp(bounds, 1) / np.linalg.norm(axes, axis=1)
     width, height = (PANEL * np.maximum(seen / seen.max(), 0.6)).astype(int)
     plotter: Any = new_plotter(
         off_screen=True,
