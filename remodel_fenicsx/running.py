@@ -305,8 +305,8 @@ def _record(
             if scene.time.is_adaptive
             else state.number + len(simulation.time_stepping.remaining())
         )
-        rank, done = -1 if quiet else comm.rank, scene.time.progress(state.number, state.time)
-        progress = stack.enter_context(Progress(steps, scene.name, rank, done=done))
+        silent, done = quiet or comm.rank != 0, scene.time.progress(state.number, state.time)
+        progress = stack.enter_context(Progress(steps, scene.name, silent, done=done))
         ranks = "1 rank" if comm.size == 1 else f"{comm.size} ranks"
         log.info(BEGUN + "%s on %s, results in %s", scene.name, ranks, place)
         log.info("%s", scene.summary())

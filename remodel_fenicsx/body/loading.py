@@ -435,7 +435,7 @@ class Loading:
             dofs = dolfinx.fem.locate_dofs_topological((subspace, collapsed), 2, facets)
             value = dolfinx.fem.Function(collapsed)
             self.boundary_conditions.append(dolfinx.fem.dirichletbc(value, dofs, subspace))
-            self.follow(name, _setter(value, dofs[1], component, displacement))
+            self.follow(name, partial(_set_values, value, dofs[1], component, displacement))
 
     def follow(self, name: str, setter: Callable[[float], None]) -> None:
         """Register a function that is called with each new magnitude of a load.
@@ -567,16 +567,13 @@ class Loading:
         self.boundary_conditions.append(dolfinx.fem.dirichletbc(value, dofs, subspace))
 
 
-def _setter(
+def _set_values(
     value: Function,
     dofs: NDArray[np.int32],
     component: int,
     displacement: Callable[[float, Array], Array],
-) -> Callable[[float], None]:
-    """Return a function that sets one component of the values on a face for a magnitude."""
+    magnitude: float,
+) -> None:
+    """Set one component of the values on a face for a magnitude."""
     places = value.function_space.tabulate_dof_coordinates()[dofs]
-
-    def set_values(magnitude: float) -> None:
-        value.x.array[dofs] = displacement(magnitude, places)[:, component]
-
-    return set_values
+    value.x.array[dofs] = displacement(magnitude, places)[:, component]

@@ -41,9 +41,8 @@ if TYPE_CHECKING:
 # ---------------------------------------------------------------- style of pictures of bodies
 # Style of figures and reports: colours of angles and dimensions of drawn chains.
 
-LEVELS = 18  # steps of 5 degrees: a colour can be read off the scale
-# matplotlib's RdYlBu in LEVELS equal steps: red along the first direction (0 degrees), blue across
-# it (90)
+# matplotlib's RdYlBu in 18 equal steps of 5 degrees, so that a colour can be read off the scale:
+# red along the first direction (0 degrees), blue across it (90)
 ANGLE_COLOURS = tuple(
     "#a50026 #c21c27 #dc3b2c #ed5f3c #f7844e #fcaa5f #fec87a #fee496 #fff6b1 #f6fbd0 "
     "#e4f4f1 #c7e7f1 #a8d6e8 #87bdd9 #69a0ca #4d7fb9 #3d5ba7 #313695".split()

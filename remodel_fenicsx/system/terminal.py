@@ -32,14 +32,14 @@ class Progress:
         self,
         total_steps: int,
         title: str,
-        comm_rank: int = 0,
+        silent: bool = False,
         *,
         interval: float = 25.0,
         done: float = 0,
     ):
         self._total, self._title = total_steps, title
         self._done = done
-        self._silent, self._interval = comm_rank != 0, interval
+        self._silent, self._interval = silent, interval
         self._line_is_due = -math.inf
         # First step and its clock time; the estimate excludes compilation.
         self._first: tuple[float, float] | None = None
@@ -96,7 +96,7 @@ class Line(Progress):
     """Progress of several runs on stderr: one changing line, or plain lines at intervals."""
 
     def __init__(self, title: str, silent: bool) -> None:
-        super().__init__(0, title, -1 if silent else 0, interval=LINE_EVERY)
+        super().__init__(0, title, silent, interval=LINE_EVERY)
 
 
 def _bar(title: str, total: int | None, done: float) -> RichProgress:
