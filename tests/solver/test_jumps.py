@@ -59,7 +59,7 @@ def test_a_limit_point_that_is_jumped_over_is_named(
     )
     assert max(np.diff(found)) > 1.5
     (said,) = warnings_of(caplog)
-    assert "limit point" in said and "a smaller time.step" in said
+    assert "limit point" in said
     place = re.search(r"The previous branch ends at pressure ([0-9.]+) \(", said)
     assert place is not None and float(place[1]) == pytest.approx(LARGEST, rel=5e-3)
 
