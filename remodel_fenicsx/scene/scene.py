@@ -835,7 +835,7 @@ def _check_load_names(shape: str, loads: object) -> None:
 def _check_load_on_face(shape: type[Shape], name: str, load: Mapping[str, object]) -> None:
     key = f"loads.{quoted(name)}"
     if not isinstance(load.get("face"), str):
-        raise validation_error("missing or no text; must be the name of a face", f"{key}.face", load.get("face"))
+        raise validation_error("missing or not the name of a face", f"{key}.face", load.get("face"))
     if name in shape.loads:
         raise validation_error(
             f"{shape.loads[name].meaning}; rename the load to use another face",
