@@ -46,7 +46,7 @@ def main(description: str | None, arguments: list[str] | None = None) -> int:
     jobs = {key: partial(running.evaluated, cases[key], source=source) for key in missing}
     done |= running.measure(jobs, said, source, options)
     records = [done[key] for key in cases if key in done]
-    print(report.table(records))
+    print(report.table(report.counts(records)))
     for record in records:
         if record["outcome"] in ("wrong", "unchecked") or options.only:
             print(
