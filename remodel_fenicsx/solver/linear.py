@@ -402,7 +402,7 @@ class Multigrid(FullNewton):
         super().tangent(norm, tolerance)
         if self._chooses:
             last = SURELY * tolerance / norm
-            self._solver.setTolerances(rtol=last if last > LAST else self._far)
+            self._solver.setTolerances(rtol=min(last, SURELY) if last > LAST else self._far)
 
     def renew(self) -> None:
         super().renew()
