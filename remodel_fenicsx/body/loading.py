@@ -435,7 +435,8 @@ class Loading:
             dofs = dolfinx.fem.locate_dofs_topological((subspace, collapsed), 2, facets)
             value = dolfinx.fem.Function(collapsed)
             self.boundary_conditions.append(dolfinx.fem.dirichletbc(value, dofs, subspace))
-            self.follow(name, partial(_set_values, value, dofs[1], component, displacement))
+            places = collapsed.tabulate_dof_coordinates()[dofs[1]]
+            self.follow(name, partial(_set_values, value, dofs[1], places, component, displacement))
 
     def follow(self, name: str, setter: Callable[[float], None]) -> None:
         """Register a function that is called with each new magnitude of a load.
@@ -570,10 +571,10 @@ class Loading:
 def _set_values(
     value: Function,
     dofs: NDArray[np.int32],
+    places: Array,
     component: int,
     displacement: Callable[[float, Array], Array],
     magnitude: float,
 ) -> None:
     """Set one component of the values on a face for a magnitude."""
-    places = value.function_space.tabulate_dof_coordinates()[dofs]
     value.x.array[dofs] = displacement(magnitude, places)[:, component]

@@ -237,10 +237,10 @@ class _SplitFormulation(DiscreteFormulation):
         self.quadrature.values(self.jacobian, ())[:] = self.jacobians() @ self._interpolation.T
 
     def jacobians(self) -> Array:
-        from remodel_fenicsx.fem.quadrature import point_values
+        from remodel_fenicsx.fem.quadrature import expression_values
 
         rule, points = self.quadrature, self._interpolation.shape[1]
-        return point_values(self._expression, rule.mesh, rule.elements, points)[..., 0]
+        return expression_values(self._expression, rule.mesh, rule.elements, points)[..., 0]
 
 
 NOT_LOCKING = "selective-integration"

@@ -172,7 +172,7 @@ def expression(
     Returns
     -------
     list of Expression
-        Vectors of components in the expression's order; `quadrature.point_values` evaluates them.
+        Vectors of components, in order; `quadrature.expression_values` evaluates them.
     """
     flat = [
         ufl_expression[place] if place else ufl_expression

@@ -47,7 +47,7 @@ def shape_functions(kind: str, degree: int, points: Array) -> Array:
     return np.asarray(element.tabulate(1, points))[..., 0]
 
 
-def point_values(
+def expression_values(
     expression: Sequence[dolfinx.fem.Expression],
     mesh: Mesh,
     elements: NDArray[np.int32],
@@ -180,7 +180,7 @@ class Quadrature:
         value_shape: tuple[int, ...],
     ) -> Array:
         """Evaluate a compiled expression at the points, ``(elements, points, *value_shape)``."""
-        values = point_values(expression, self.mesh, self.elements, self.shape[1])
+        values = expression_values(expression, self.mesh, self.elements, self.shape[1])
         return values.reshape(*self.shape, *value_shape)
 
     def owned(self, values: NDArray[Any]) -> NDArray[Any]:

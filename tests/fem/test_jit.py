@@ -161,7 +161,7 @@ for _ in range(2):
     value = first**2 * second**3
     derivatives = ufl.as_vector([ufl.diff(value, first), ufl.diff(value, second)])
     compiled = jit.expression(derivatives, numpy.array([[0.5, 0.25, 0.0]]))
-    numpy.testing.assert_allclose(quadrature.point_values(compiled, mesh, numpy.zeros(1, numpy.int32), 1)[0], [[1 / 64, 3 / 64]])
+    numpy.testing.assert_allclose(quadrature.expression_values(compiled, mesh, numpy.zeros(1, numpy.int32), 1)[0], [[1 / 64, 3 / 64]])
 print(len(jit.compiled_kernels))
 """
 

@@ -13,7 +13,7 @@ import ufl
 from mpi4py import MPI
 
 from remodel_fenicsx.fem import jit
-from remodel_fenicsx.fem.quadrature import point_values
+from remodel_fenicsx.fem.quadrature import expression_values
 from remodel_fenicsx.model.cells import UnitCell
 from remodel_fenicsx.schema.settings import Material
 from tests.parts import random_rotations
@@ -90,7 +90,7 @@ class Points:
         for function, values in (self.F, F), (self.l, l), (self.n, n):
             function.x.array[:] = np.resize(values, (self.count, *values.shape[1:])).ravel()
         elements = np.arange(8, dtype=np.int32)
-        result = point_values(self.expression, self.mesh, elements, POINTS_PER_CELL).reshape(
+        result = expression_values(self.expression, self.mesh, elements, POINTS_PER_CELL).reshape(
             self.count, 2, 19
         )[: len(F)]
         return {
