@@ -159,9 +159,9 @@ length_unit = "mm"
 outlet = ["outlet_1", "outlet_2", "outlet_3", "outlet_4"]
 [material]
 stress_unit = "kPa"
-lame_lambda = 540.0
-lame_mu = 60.0
-chain_density = 6e25
+lame_lambda = 2700.0
+lame_mu = 300.0
+chain_density = 1.2e26
 [cells]
 initial = "isotropic"
 [supports.inlet]

@@ -11,6 +11,8 @@ from tempfile import TemporaryDirectory
 from typing import Any
 
 import numpy as np
+import ufl
+from dolfinx.fem import Form, Function
 from mpi4py import MPI
 
 from remodel_fenicsx.body.domain import dof_of_node
@@ -20,6 +22,7 @@ from remodel_fenicsx.body.mesh_file import MeshFile, gmsh_text
 from remodel_fenicsx.errors import RemodelError, SOLVE_FAILED
 from remodel_fenicsx.body.wall import RoundWall
 from remodel_fenicsx.model.residual_stress import Loads, close_ring
+from remodel_fenicsx.fem import jit
 from remodel_fenicsx.fem.assembly import raise_on_all_ranks
 from remodel_fenicsx.model.tensors import Array
 from remodel_fenicsx.scene.scene import Scene, SceneError, too_soft
@@ -27,6 +30,7 @@ from remodel_fenicsx.schema import processes
 from remodel_fenicsx.schema.settings import AS_GIVEN, EQUILIBRIUM, Natural
 from remodel_fenicsx.simulation import Simulation
 from remodel_fenicsx.solver.continuation import StepFailure
+from remodel_fenicsx.solver.equilibrium import Equilibrium
 from remodel_fenicsx.system import NOTICE
 from remodel_fenicsx.system.terminal import Line, muted_warnings
 
@@ -145,12 +149,12 @@ def found_unloaded(
 
     how: dict[str, Any] = {"alpha": scale, "line_search": None, "maxiter": MAX_FORWARD_RUNS}
     done, step = 0.0, 1.0
-    change: Any = 0.0  # correction of `start` per unit of the load factor
+    change: Any = 0.0  # correction of `start` at the last load factor
     while done < 1.0:
         share, words = min(done + step, 1.0), ""
         try:
             first, nearly = start(share), tolerance if share == 1.0 else ON_THE_WAY
-            change = (broyden1(error, first + share * change, f_tol=nearly, **how) - first) / share
+            change = broyden1(error, first + change, f_tol=nearly, **how) - first
             done = share
         except (*REFUSALS, NoConvergence) as refusal:
             reason = f"no convergence in {MAX_FORWARD_RUNS} iterations{words}"
@@ -288,8 +292,10 @@ def _with_dimensions(scene: Scene, numbers: Array) -> Scene:
 
 # ---------------------------------------------------------------- unloaded meshes
 # Positions of all nodes. The residual is that of the unloaded body under its loads, displaced to
-# the measured positions. Their distance from the loaded positions is the increment of one Newton
-# step of that body.
+# the measured positions. Broyden's method takes the Newton steps for it, with the derivative with
+# respect to unloaded positions (Govindjee and Mihalic, 1996). The tangent of the body itself does
+# not replace it: near a limit point of a thin wall it is almost singular, because a pressure
+# follows the displacement.
 
 UNLOADED_MESH = "unloaded.msh"
 # Largest distance of a node from its measured position, over the body's extent.
@@ -361,8 +367,48 @@ def _has_valid_elements(file: MeshFile) -> bool:
     return bool((determinants * np.sign(determinants.mean()) > 0).all())
 
 
+def inverse_tangent(equilibrium: Equilibrium) -> list[Form]:
+    """Return minus the derivative of the residual with respect to unloaded positions, compiled.
+
+    Positions under load are fixed, and with them the forces of a pressure. With X + V in place of
+    X, F is F (I - grad V) and a volume grows by div V, to the first order in V. The forces of the
+    matrix and of the network come first; the stiffness of springs, if there are any, is last.
+
+    Parameters
+    ----------
+    equilibrium
+        Equilibrium of the unloaded body.
+
+    Returns
+    -------
+    list
+        Compiled bilinear forms; their sum takes V, in the unit of length, to forces.
+
+    References
+    ----------
+    Govindjee and Mihalic, Comput. Methods Appl. Mech. Eng. 136 (1996): inverse elastostatics.
+    """
+    state = equilibrium.state
+    unknown, kinematics, mesh = state.unknown, state.kinematics, equilibrium.quadrature.mesh
+    space = unknown.function_space
+    test, trial = ufl.TestFunction(space), ufl.TrialFunction(space)
+    moved = Function(space)
+    gradient = kinematics.deformation_gradient(unknown) * (ufl.Identity(3) - ufl.grad(moved))
+    energies = state.dilatation.energies(
+        equilibrium.tissue,
+        kinematics.elastic(gradient),
+        [state.cells.symbolic_cell],
+        kinematics.stress_free_weight(mesh) * (1 + ufl.div(moved)),
+    )
+    forms = [-ufl.derivative(ufl.derivative(e, unknown, test), moved, trial) for e in energies]
+    springs = state.loading.residual_of_potentials(test)
+    if springs is not None:
+        forms.append(ufl.derivative(springs, unknown, trial))
+    return [jit.form(form) for form in forms]
+
+
 def _missed(simulation: Simulation, given: Array, share: float) -> Array:
-    """Return distances to loaded positions (nodes, 3), in file order on all ranks. Collective."""
+    """Return increments of unloaded positions (nodes, 3), in file order. Collective."""
     domain, unknown = simulation.domain, simulation.unknown
     coupling = simulation.stepper.coupling
     loads = simulation.load_values(simulation.scene.end_of_ramps)
@@ -371,6 +417,7 @@ def _missed(simulation: Simulation, given: Array, share: float) -> Array:
     unknown.x.array.reshape(-1, 3)[dofs] = given[domain.node_number] - domain.mesh.geometry.x
     if not coupling.equilibrium.limits().admissible:
         raise ArithmeticError("no admissible state on the path: r >= L or J <= 0")
+    coupling.equilibrium.tangent_forms = inverse_tangent(coupling.equilibrium)
     change = coupling.newton.newton_correction(coupling.equilibrium, 0)
     distances: Array = domain.comm.bcast(domain.gather_nodes(-change.reshape(-1, 3)[dofs]))
     if not np.isfinite(distances).all():
