@@ -389,7 +389,7 @@ def inverse_tangent(equilibrium: Equilibrium) -> list[Form]:
     Govindjee and Mihalic, Comput. Methods Appl. Mech. Eng. 136 (1996): inverse elastostatics.
     """
     state = equilibrium.state
-    unknown, kinematics, mesh = state.unknown, state.kinematics, equilibrium.quadrature.mesh
+    unknown, kinematics = state.unknown, state.kinematics
     space = unknown.function_space
     test, trial = ufl.TestFunction(space), ufl.TrialFunction(space)
     moved = Function(space)
@@ -398,7 +398,7 @@ def inverse_tangent(equilibrium: Equilibrium) -> list[Form]:
         equilibrium.tissue,
         kinematics.elastic(gradient),
         [state.cells.symbolic_cell],
-        kinematics.stress_free_weight(mesh) * (1 + ufl.div(moved)),
+        kinematics.stress_free_weight(space.mesh) * (1 + ufl.div(moved)),
     )
     forms = [-ufl.derivative(ufl.derivative(e, unknown, test), moved, trial) for e in energies]
     springs = state.loading.residual_of_potentials(test)
