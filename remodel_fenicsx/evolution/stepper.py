@@ -679,8 +679,6 @@ def times(end: float, step: float) -> Iterator[float]:
 # A signal requests the stop, or the wall time limit requires it.
 
 MARGIN = 1.2  # wall time reserved for the next step, as a multiple of the longest recent one
-NOT_ASKED, BY_SIGNAL, BY_CLOCK = range(3)
-REASONS = {BY_SIGNAL: "stopped by SIGUSR1", BY_CLOCK: "stopped before --max-wall-time is over"}
 
 
 class Pause(Watcher):
@@ -691,7 +689,7 @@ class Pause(Watcher):
         comm: MPI.Comm,
         folder: Path,
         is_requested: Callable[[], bool],
-        deadline: float | None = None,
+        deadline: float | None,
     ):
         self.comm, self.folder = comm, folder
         self.is_requested, self.deadline = is_requested, deadline
@@ -716,10 +714,9 @@ class Pause(Watcher):
             self._check(step)
 
     def _check(self, step: Step) -> None:
-        reason = BY_SIGNAL if self.is_requested() else NOT_ASKED
+        reason = "stopped by SIGUSR1" if self.is_requested() else ""
         if self.deadline is not None and self.comm.rank == 0 and not reason:
-            late = clock.monotonic() + MARGIN * self._seconds > self.deadline
-            reason = BY_CLOCK if late else NOT_ASKED
-        reasons = [code for code in self.comm.allgather(reason) if code]
-        if reasons:
-            raise Paused(REASONS[reasons[0]], step.time, self.folder)
+            if clock.monotonic() + MARGIN * self._seconds > self.deadline:
+                reason = "stopped before --max-wall-time is over"
+        if reasons := list(filter(None, self.comm.allgather(reason))):
+            raise Paused(reasons[0], step.time, self.folder)
