@@ -184,7 +184,7 @@ def choice(scene: Scene) -> Choice:
     exact = (
         name
         for name, reasons in reasons_by_name.items()
-        if not reasons and not is_for_means(scene, name)
+        if not reasons and not reasons_for_means(scene, name)
     )
     return Choice(next(exact, "full"), reasons_by_name)
 
@@ -207,17 +207,16 @@ def _reasons(rules: Sequence[Rule], scene: Scene) -> list[str]:
     return [reason for rule in rules if (reason := rule(scene)) is not None]
 
 
-def is_for_means(scene: Scene, name: str) -> bool:
-    """Return whether an allowed kinematics is right only for means over many seeds."""
+def reasons_for_means(scene: Scene, name: str) -> list[str]:
+    """Return why an allowed kinematics is right only for means over many seeds; none if exact."""
     reductions = scene.geometry.reductions
-    return name in reductions and bool(_reasons(reductions[name].in_the_mean, scene))
+    return _reasons(reductions[name].in_the_mean, scene) if name in reductions else []
 
 
 def only_for_means(scene: Scene) -> list[str]:
     """Return why the scene's own kinematics is right only for means over seeds; none if exact."""
-    name, reductions = scene.model.kinematics, scene.geometry.reductions
-    reasons = _reasons(reductions[name].in_the_mean, scene) if name in reductions else []
-    return [f"{name!r}: {reason}" for reason in reasons]
+    name = scene.model.kinematics
+    return [f"{name!r}: {reason}" for reason in reasons_for_means(scene, name)]
 
 
 def for_means(scene: Scene) -> str:
@@ -227,7 +226,7 @@ def for_means(scene: Scene) -> str:
     suitable = (
         name
         for name in scene.geometry.reductions
-        if is_for_means(scene, name) and not objections(scene, name)
+        if reasons_for_means(scene, name) and not objections(scene, name)
     )
     return next(suitable, AUTO)
 
@@ -238,7 +237,7 @@ def describe_choice(scene: Scene) -> list[str]:
     lines = [f"kinematics {made.name!r}: {KINEMATICS[made.name].meaning}"]
     for name, reasons in made.objections.items():
         if name != made.name:
-            means = " for means over seeds" if is_for_means(scene, name) else ""
+            means = " for means over seeds" if reasons_for_means(scene, name) else ""
             verdict = f"not allowed: {'; '.join(reasons)}" if reasons else f"allowed{means}"
             lines.append(f"{name!r}, {verdict}")
     lines += only_for_means(scene)

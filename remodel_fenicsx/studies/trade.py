@@ -14,7 +14,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from matplotlib.figure import Figure
 
-from remodel_fenicsx.body.reductions import AUTO, choice, is_for_means, objections, step_cost
+from remodel_fenicsx.body.reductions import AUTO, choice, objections, reasons_for_means, step_cost
 from remodel_fenicsx.body.shape import FromFile, PROFILE
 from remodel_fenicsx.fem.kinematics import KINEMATICS
 from remodel_fenicsx.model.laws import LAWS
@@ -118,7 +118,7 @@ def _wanted(scene: Scene, base: Scene) -> Iterator[tuple[str, dict[str, Any]]]:
         }
     yield "", {KINEMATIC: choice(scene).name}
     for name in ("sector", "full"):
-        if not (objections(scene, name) or is_for_means(scene, name)):
+        if not (objections(scene, name) or reasons_for_means(scene, name)):
             yield "", {KINEMATIC: name}
 
 
