@@ -63,7 +63,7 @@ class SolverMethod:
 
 
 NEWTON = {"snes_type": "newtonls", "snes_linesearch_type": "basic"}
-MUMPS_LU = {
+MUMPS_LU: dict[str, object] = {
     "pc_type": "lu",
     "pc_factor_mat_solver_type": "mumps",
 }
@@ -118,7 +118,7 @@ REMOVED = {"exact": "was removed; use 'lagged', or 'direct' for a new tangent in
 # By CHOLMOD, and by MUMPS.
 DEFINITE, SYMMETRIC = "Cholesky factorisation", "LDL^T factorisation"
 GENERAL = "LU factorisation"
-FACTOR_OPTIONS = {
+FACTOR_OPTIONS: dict[str, dict[str, object]] = {
     DEFINITE: {
         "pc_type": "cholesky",
         "pc_factor_mat_solver_type": "cholmod",
@@ -131,7 +131,7 @@ FACTOR_OPTIONS = {
         # SCOTCH is as fast as any; PORD kills the process for some small matrices.
         "mat_mumps_icntl_7": 3,
     },
-    GENERAL: SOLVER_METHODS["direct"].options,
+    GENERAL: MUMPS_LU,
 }
 
 # Unknowns up to which PETSc's own LU of every tangent is the fastest on one rank. The matrix of a
@@ -172,7 +172,7 @@ def levels_options(ranks: int, is_stiff: bool) -> dict[str, object]:
     """Return the PETSc options of two levels, of which the lower one is factorised."""
     # On a thin wall GAMG instead of the factor takes 1.5 times as many iterations, and block
     # Jacobi instead of SOR four times as many.
-    factor = factor_options(SYMMETRIC)
+    factor = FACTOR_OPTIONS[SYMMETRIC]
     if ranks > 1:
         factor = gathered(factor) | {"pc_telescope_reduction_factor": ranks}
     return {
@@ -184,15 +184,6 @@ def levels_options(ranks: int, is_stiff: bool) -> dict[str, object]:
         "mg_levels_ksp_max_it": 2 if is_stiff else 1,
         "mg_levels_pc_type": "sor",
         **{f"mg_coarse_{name}": value for name, value in factor.items()},
-    }
-
-
-def factor_options(kind: str) -> dict[str, object]:
-    """Return PETSc options of a factorisation on one rank; `kind`: key of `FACTOR_OPTIONS`."""
-    return {
-        name: value
-        for name, value in FACTOR_OPTIONS[kind].items()
-        if name.startswith(("pc_", "mat_"))
     }
 
 

@@ -22,11 +22,11 @@ from remodel_fenicsx.fem.assembly import (
 )
 from remodel_fenicsx.fem.solver_methods import (
     DEFINITE,
+    FACTOR_OPTIONS,
     GENERAL,
     LAGGED,
     ProblemOptions,
     SYMMETRIC,
-    factor_options,
 )
 from remodel_fenicsx.model.tensors import Array
 from remodel_fenicsx.solver.equilibrium import Equilibrium
@@ -177,7 +177,7 @@ class LaggedFactorisation:
     def _factorised(self, kind: str, matrix: Mat) -> bool:
         if self._kind != kind:
             self.close()
-            self._options = ProblemOptions(factor_options(kind), {})
+            self._options = ProblemOptions(FACTOR_OPTIONS[kind], {})
             self.preconditioner, self._kind = PETSc.PC().create(self.comm), kind
             self._options.apply(self.preconditioner)
         matrix.setOption(PETSc.Mat.Option.SPD, kind == DEFINITE)
@@ -440,7 +440,7 @@ def cheaper_method(equilibrium: Equilibrium) -> str:
     """Return the method for a large tangent, by the cost of factorising it. Collective."""
     matrix = equilibrium.create_matrix()
     # One megabyte is too little for the factor, so that MUMPS ends after its analysis.
-    options = ProblemOptions(factor_options(SYMMETRIC) | {"mat_mumps_icntl_23": 1}, {})
+    options = ProblemOptions(FACTOR_OPTIONS[SYMMETRIC] | {"mat_mumps_icntl_23": 1}, {})
     preconditioner = PETSc.PC().create(matrix.comm)
     preconditioner.setOperators(matrix)
     options.apply(preconditioner)
