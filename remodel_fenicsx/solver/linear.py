@@ -284,7 +284,6 @@ class FullNewton:
         self.equilibrium, self.snes = equilibrium, snes
         self.matrix, self.options = matrix, options
         self.tangents = 0
-        self._always = False  # whether nothing is reused between iterations
 
     def begin(self) -> None:
         """Prepare for a new solve."""
@@ -327,22 +326,6 @@ class FullNewton:
     def iteration_factor(self) -> int:
         """Factor on the key solver.maximum_iterations."""
         return 1
-
-    @contextmanager
-    def _anew(self) -> Iterator[None]:
-        """Reuse nothing between iterations while the block runs."""
-        before, self._always = self._always, True
-        try:
-            yield
-        finally:
-            self._always = before
-
-    def _set_up(self) -> None:
-        """Set up the preconditioner for the present tangent, which PETSc would otherwise reuse."""
-        preconditioner = self.snes.getKSP().getPC()
-        preconditioner.setReusePreconditioner(False)
-        preconditioner.setOperators(self.matrix)
-        preconditioner.setUp()
 
     def factorisation(self) -> PC | None:
         """Return PETSc's preconditioner with the last factorisation, or None without one."""
@@ -414,8 +397,11 @@ class Multigrid(FullNewton):
             return
         if self._levels is not None:
             self._levels.renew(self.matrix)
-        self._set_up()
-        self._solver.getPC().setReusePreconditioner(True)
+        preconditioner = self._solver.getPC()
+        preconditioner.setReusePreconditioner(False)
+        preconditioner.setOperators(self.matrix)
+        preconditioner.setUp()
+        preconditioner.setReusePreconditioner(True)
 
     def fallback(self) -> tuple[str, AbstractContextManager[None]] | None:
         failed = self.snes.getConvergedReason() == PETSc.SNES.ConvergedReason.DIVERGED_LINEAR_SOLVE
@@ -483,6 +469,7 @@ class Lagged(FullNewton):
             preconditioner.setType(PETSc.PC.Type.PYTHON)
             preconditioner.setPythonContext(self.factor)
         self.secants = LimitedMemoryUpdate(equilibrium.comm)
+        self._always = False  # whether nothing is reused between iterations
         self._before = 0  # number of tangents before the solve
         # Norms of the residual in this solve since the tangent was renewed.
         self._norms: list[float] = []
@@ -550,6 +537,15 @@ class Lagged(FullNewton):
         return (
             None if self._always else ("with a new factorisation in every iteration", self._anew())
         )
+
+    @contextmanager
+    def _anew(self) -> Iterator[None]:
+        """Reuse nothing between iterations while the block runs."""
+        self._always = True
+        try:
+            yield
+        finally:
+            self._always = False
 
     def _costs_more(self, tolerance: float) -> bool:
         """Return whether the remaining iterations cost more than factorising, or diverge."""
