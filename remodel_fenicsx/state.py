@@ -293,16 +293,8 @@ class State:
         self.tell: Callable[[str], object] = lambda words: None  # shows the progress of substeps
         self.mark_cells_in_equilibrium()
         solved = self.equilibrium_cells
-        self._functions: dict[str, dolfinx.fem.Function] = {}
-        self._arrays: dict[str, Array] = {}  # the functions' own memory
-        for function in (
-            self.unknown,
-            cells.dimensions,
-            cells.axes,
-            solved.dimensions,
-            solved.axes,
-        ):
-            self._add(function)
+        own = unknown, cells.dimensions, cells.axes, solved.dimensions, solved.axes
+        self._functions = {function.name: function for function in own}
         self.time, self.number = 0.0, 0
         self.numbers: dict[str, float] = {}
         self.counts: dict[str, str] = {}
@@ -462,9 +454,6 @@ class State:
         for case in (self, *self.other_cases):
             case.time, case.number = time, number
 
-    def _add(self, function: dolfinx.fem.Function) -> None:
-        self._functions[function.name], self._arrays[function.name] = function, function.x.array
-
     def remember(self, function: dolfinx.fem.Function, count: str | None = None) -> None:
         """Add a dolfinx function with a unique name to the state.
 
@@ -486,7 +475,7 @@ class State:
         """
         if function.name in self._functions:
             raise ValueError(f"the state has a function {function.name!r} already")
-        self._add(function)
+        self._functions[function.name] = function
         if count is not None:
             self.counts[function.name] = count
 
@@ -496,7 +485,7 @@ class State:
 
     def snapshot(self) -> Snapshot:
         """Return a copy of all values."""
-        arrays = {name: array.copy() for name, array in self._arrays.items()}
+        arrays = {name: function.x.array.copy() for name, function in self._functions.items()}
         others = [case.snapshot() for case in self.other_cases]
         return Snapshot(
             arrays, dict(self.loading.values), self.time, self.number, dict(self.numbers), others
@@ -510,8 +499,8 @@ class State:
         snapshot
             Values of this state.
         """
-        for name, array in self._arrays.items():
-            array[:] = snapshot.arrays[name]
+        for name, function in self._functions.items():
+            function.x.array[:] = snapshot.arrays[name]
         self.loading.set(snapshot.loads)
         self.time, self.number = snapshot.time, snapshot.number
         self.numbers = dict(snapshot.numbers)
