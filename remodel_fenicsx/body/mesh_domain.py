@@ -117,7 +117,7 @@ def shared(
             extent,
             regions,
             boundary,
-            rims_of(file, boundary, "inner"),
+            rims_of(file, boundary),
         )
     kind, degree, none, extent, regions, boundary, lines = comm.bcast(told)
     mesh = dolfinx.mesh.create_mesh(

@@ -141,10 +141,10 @@ def through_the_wall(boundary: Boundary) -> bool:
     return bool(np.isin(inner, outer).any())
 
 
-def rims_of(file: MeshFile, boundary: Boundary, face: str) -> list[Integers]:
-    """Return the closed lines that bound a face, as edges (edges, 2 or 3: start, end, middle)."""
+def rims_of(file: MeshFile, boundary: Boundary) -> list[Integers]:
+    """Return the closed lines around the inner face, as edges (n, 2 or 3: start, end, middle)."""
     # The normal of a flat cap on such a line points out of the enclosed region.
-    there = boundary.owner == face
+    there = boundary.owner == "inner"
     lines = rims(boundary.facets[there])
     if file.degree == 1:
         return lines

@@ -409,9 +409,7 @@ class _KinematicsWrapper:
             raise AttributeError(name)
         return getattr(self.field, name)
 
-    def elastic_gradient(self, unknown: Function) -> Expr:
-        """Return F_e, UFL: the deformation gradient of the tissue."""
-        return self.elastic(self.deformation_gradient(unknown))
+    elastic_gradient = Kinematics.elastic_gradient  # of this F, not of that of the field
 
 
 @with_old_names

@@ -48,7 +48,7 @@ class Panels:
 
     def __init__(self, edges: Sequence[float], degree: int):
         self.edges, self.degree = np.asarray(edges, dtype=np.float64), degree
-        self._points = points = np.cos(np.pi * np.arange(degree, -1, -1) / degree)
+        points = np.cos(np.pi * np.arange(degree, -1, -1) / degree)
         self._half = np.diff(self.edges)[:, None] / 2
         self.places: Array = self.edges[:-1, None] + self._half * (points + 1)
         self.places[:, -1] = self.edges[1:]

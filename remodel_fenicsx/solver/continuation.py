@@ -182,7 +182,7 @@ class Continuation:
         # continues beyond the jump.
         done, attempts = 0.0, 0
         if failure is not None:
-            part = self._bisect(part, done, failure, work)
+            part = self._bisect(part, done, failure)
         vector = self.state.unknown.x
         while done < 1.0:
             attempts += 1
@@ -201,7 +201,7 @@ class Continuation:
             work.add(solution)
             if isinstance(solution, SolveFailure):
                 vector.array[:] = before
-                part = self._bisect(part, done, solution, work)
+                part = self._bisect(part, done, solution)
             else:
                 expected = 0.0 if self._direction is None else part * self._size(self._direction)
                 moved = self._size(vector.array - before)
@@ -319,7 +319,7 @@ class Continuation:
                 self.time, far, loads or "the start", refusal,
             )  # fmt: skip
 
-    def _bisect(self, part: float, done: float, failure: SolveFailure, work: Work) -> float:
+    def _bisect(self, part: float, done: float, failure: SolveFailure) -> float:
         if part / 2 < self._smallest:
             text = self.state.label + failure_text(self.time, self.stage, done, failure)
             self.set_fraction(done)  # the last solved state
