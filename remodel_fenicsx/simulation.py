@@ -115,7 +115,7 @@ class Simulation:
         case
             Index of the load case from 0, one less than `Step.case`.
         """
-        return values_of_loads(list(self.scene.each_case())[case].loads, time)
+        return values_of_loads(self.scene.each_case()[case].loads, time)
 
     def steps(self, watchers: Sequence[Watcher] = ()) -> Iterator[Step]:
         """Solve and remodel from the present state, and yield each accepted step.

@@ -186,7 +186,7 @@ def outward_areas(mesh: Mesh, facets: Facets) -> Array:
 def area(mesh: Mesh, facets: Facets) -> float:
     """Return the area of facets, from their corners, over all ranks. Collective."""
     local = float(np.linalg.norm(outward_areas(mesh, facets), axis=1).sum())
-    return float(allreduce(mesh.comm, local, MPI.SUM))
+    return allreduce(mesh.comm, local, MPI.SUM)
 
 
 # ---------------------------------------------------------------- local axes, depth and station

@@ -466,7 +466,7 @@ class Staggered:
         if any(process.changes for process in self.remodeling.additional_processes):
             return True
         are_equal = self.state.equilibrium_cells.equals(self.state.cells)
-        return bool(self.state.comm.allreduce(int(not are_equal)) > 0)
+        return self.state.comm.allreduce(int(not are_equal)) > 0
 
 
 def between(old: LoadValues, new: LoadValues, fraction: float) -> LoadValues:
@@ -573,11 +573,8 @@ class Extrapolated(Staggered):
 def count_points(state: State, points: Flags) -> int:
     """Count selected points (n,) over all ranks. Collective."""
     quadrature = state.cells.quadrature
-    return int(
-        allreduce(
-            state.comm, int(quadrature.owned(points.reshape(quadrature.shape)).sum()), MPI.SUM
-        )
-    )
+    owned = quadrature.owned(points.reshape(quadrature.shape))
+    return allreduce(state.comm, int(owned.sum()), MPI.SUM)
 
 
 def target_from_records(records: NDArray[np.void]) -> Target:

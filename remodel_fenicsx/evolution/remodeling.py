@@ -267,7 +267,7 @@ class RemodelingPass(Remodels):
         """Return the volume fraction without a principal value above `remodeling.threshold`."""
         tensor = self.drive().tensor if self.further else self.driving_tensor()[1]
         inactive = np.linalg.eigvalsh(tensor)[:, -1] <= self.settings.threshold
-        return float(self.quadrature.mean(inactive.reshape(self.quadrature.shape).astype(float)))
+        return self.quadrature.mean(inactive.reshape(self.quadrature.shape).astype(float))
 
     def cells_towards(
         self, target: Target, duration: float, cells: UnitCell | None = None

@@ -165,8 +165,9 @@ class TurnoverPass(Remodels):
         # `_last_solved`: in the last solved state
         # `_present`: in the equilibrium of this step
         # `_higher_order`: by the higher-order rule, for the error of the step
-        self._step_start = self._last_solved = self._present = self.logarithms()
-        self._higher_order = self._present
+        self._step_start = self._last_solved = self._present = self._higher_order = (
+            self.logarithms()
+        )
         self.watchers = (UnboundedGrowth.for_scene,)
         # Rates at the start of the step, for a coupling of order 2; None for order 1.
         self._start_rates: Array | None = None
@@ -176,8 +177,9 @@ class TurnoverPass(Remodels):
         """Set content, natural length and J_g from fields of an earlier run."""
         for name in TURNED_OVER:
             self._values(name)[:] = values(name)
-        self._step_start = self._last_solved = self._present = self.logarithms()
-        self._higher_order = self._present
+        self._step_start = self._last_solved = self._present = self._higher_order = (
+            self.logarithms()
+        )
         if self.growth is not None:
             self.growth.set_initial(self._values("content"), values(GROWTH))
 
@@ -329,21 +331,21 @@ class TurnoverPass(Remodels):
         increment = self._parameters.at_points().turnover_increment(
             self.state.elastic_gradient(), cells, *self.rates()
         )
-        return 0.0 - float(self.quadrature.integral(self.state.per_mesh_volume(increment)))
+        return 0.0 - self.quadrature.integral(self.state.per_mesh_volume(increment))
 
     def mean(self, name: str) -> float:
         """Return the volume mean of `content` or `natural_length`."""
-        return float(self.quadrature.mean(self._values(name)))
+        return self.quadrature.mean(self._values(name))
 
     def mean_volume_ratio(self) -> float:
         """Return the volume mean of `Growth.ratio`, for tissue that grows."""
         assert self.growth is not None
-        return float(self.quadrature.mean(self.growth.ratio))
+        return self.quadrature.mean(self.growth.ratio)
 
     def collagen_share(self) -> float:
         """Return the volume mean of `Growth.share`, for tissue that grows."""
         assert self.growth is not None
-        return float(self.quadrature.mean(self.growth.share(self._values("content"))))
+        return self.quadrature.mean(self.growth.share(self._values("content")))
 
     def _values(self, name: str) -> Array:
         return self.quadrature.values(getattr(self.tissue, name), ())

@@ -267,7 +267,7 @@ class CachedValue(Generic[T]):
         numbers = [number.tobytes() for number in self._numbers]
         known = numbers == self._seen_numbers and all(map(np.array_equal, self._arrays, self._seen))
         if self._comm is not None:
-            known = bool(allreduce(self._comm, known, MPI.LAND))
+            known = allreduce(self._comm, known, MPI.LAND)
         if not known:
             self.forget()  # in case `make` fails
             self._value = make()

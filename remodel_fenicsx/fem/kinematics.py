@@ -495,7 +495,7 @@ class _WithNumbers(_KinematicsWrapper):
         space = unknown.function_space
         dofs = space.sub(component).dofmap.list.flatten()
         here = float(unknown.x.array[dofs[0]]) if len(dofs) else -np.inf
-        return float(space.mesh.comm.allreduce(here, MPI.MAX))
+        return space.mesh.comm.allreduce(here, MPI.MAX)
 
 
 class FreeLength(_WithNumbers):

@@ -190,7 +190,7 @@ class Quadrature:
     def integral(self, values: Array) -> float:
         """Integrate values (elements or owned elements, points) over the body. Collective."""
         local = float((self.owned(values) * self.owned(self.volumes)).sum())
-        return float(allreduce(self.mesh.comm, local, MPI.SUM))
+        return allreduce(self.mesh.comm, local, MPI.SUM)
 
     def mean(self, values: Array) -> float:
         """Return the volume mean of values (elements, points). Collective."""
@@ -328,7 +328,7 @@ class Quadrature:
     def maximum(self, values: Array) -> float:
         """Return the largest of values (elements, ...) over all ranks. Collective."""
         local = float(np.max(self.owned(values), initial=-np.inf))
-        return float(allreduce(self.mesh.comm, local, MPI.MAX))
+        return allreduce(self.mesh.comm, local, MPI.MAX)
 
     def argmax_position(self, values: Array) -> tuple[float, float, float]:
         """Return the reference position of the largest of values (elements, points). Collective."""

@@ -295,7 +295,7 @@ class Continuation:
 
     def _size(self, change: Array) -> float:
         """Return the largest change of an unknown over all ranks. Collective."""
-        return float(allreduce(self.state.comm, float(np.abs(change).max(initial=0.0)), MPI.MAX))
+        return allreduce(self.state.comm, float(np.abs(change).max(initial=0.0)), MPI.MAX)
 
     def _may_check_jumps(self) -> bool:
         """Return whether a possible jump is checked."""

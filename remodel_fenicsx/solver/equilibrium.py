@@ -280,7 +280,7 @@ class Equilibrium:
         change, own = (np.einsum("nij,nij->n", each, each) for each in (G - F, F))
         at = np.flatnonzero((J <= 0.0) | (np.sqrt(change) * own >= 2.0 * J))
         turns = at.size > 0 and bool(determinant_changes_sign(F[at], G[at]).any())
-        return bool(allreduce(self.comm, turns, MPI.LOR))
+        return allreduce(self.comm, turns, MPI.LOR)
 
     def safe_change(self, far: float) -> float:
         """Return the largest |dF| with J > 0 and r/L < `far` at all points. Collective."""
@@ -369,7 +369,7 @@ class Equilibrium:
         """Return the largest difference of an unknown from its prescribed value. Collective."""
         vector = self.state.unknown.x
         gap = np.abs(self.prescribed_values() - vector.array)
-        return float(allreduce(self.comm, float(np.nanmax(gap, initial=0.0)), MPI.MAX))
+        return allreduce(self.comm, float(np.nanmax(gap, initial=0.0)), MPI.MAX)
 
 
 def _smallest(values: Array) -> float:

@@ -86,7 +86,7 @@ class LimitedMemoryUpdate:
         return bool(weights)
 
     def _product(self, one: Array, other: Array) -> float:
-        return float(allreduce(self._comm, one @ other, MPI.SUM))
+        return allreduce(self._comm, one @ other, MPI.SUM)
 
 
 log = logging.getLogger(__name__)

@@ -53,7 +53,7 @@ def pass_factor(stepper: Stepper, step: Step) -> float:
         return structure_tensor(*relaxed_cells[:2])
 
     def dot(one: Array, other: Array) -> float:
-        return float(quadrature.integral(np.sum(one * other, axis=(1, 2))))
+        return quadrature.integral(np.sum(one * other, axis=(1, 2)))
 
     factors: list[float] = []
     with state.tentative():
