@@ -313,7 +313,7 @@ _QUADRILATERAL = {1: [0, 1, 2, 3], 2: [0, 2, 6, 8, 1, 3, 5, 7, 4]}
 
 def lattice_domain(
     points: Array, counts: Sequence[int], degree: int, faces: Mapping[str, Marker], shape: str,
-    dimensions: dict[str, float], comm: MPI.Intracomm | None = None,
+    dimensions: dict[str, float], comm: MPI.Intracomm | None,
 ) -> Domain:  # fmt: skip
     """Mesh nodes in rows by lines or quadrilaterals. Collective."""
     comm = comm or MPI.COMM_WORLD

@@ -1078,7 +1078,7 @@ def homogeneous_bar(
 ) -> reduced.Reduction:
     """Return the reduction "point", of uniform strain, for a body between two faces across z."""
 
-    def build(scene: Scene, comm: MPI.Intracomm | None = None) -> Domain:
+    def build(scene: Scene, comm: MPI.Intracomm | None) -> Domain:
         from remodel_fenicsx.body.domain import lattice_domain
 
         shape, length = scene.geometry, scene.geometry.axial_length

@@ -149,9 +149,7 @@ def outer_radius(area: float, refinement: int = 1, degree: int = 1) -> float:
     return float(np.sqrt(area / (number * sector)))
 
 
-def draw_tendon(
-    length: float, area: float, refinement: int = 1, element: str = "hexahedron", degree: int = 1
-) -> None:
+def draw_tendon(length: float, area: float, refinement: int, element: str, degree: int) -> None:
     """Draw and mesh the tendon in Gmsh: a core and four ring quarters, extruded."""
     radius = outer_radius(area, refinement, degree)
     number, quarter = AROUND * refinement, CORE * refinement

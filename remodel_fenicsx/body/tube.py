@@ -58,7 +58,7 @@ PAPER = (16, 8, 12)  # the paper's elements around, through the wall, and along
 # ---------------------------------------------------------------- meshes of reductions
 
 
-def build_in_half_plane(dimension: int, scene: Scene, comm: MPI.Intracomm | None = None) -> Domain:
+def build_in_half_plane(dimension: int, scene: Scene, comm: MPI.Intracomm | None) -> Domain:
     """Mesh the wall with the body's elements on the x axis (1) or in the half-plane y = 0 (2)."""
     from remodel_fenicsx.body.domain import lattice_domain
 
@@ -83,7 +83,7 @@ def build_in_half_plane(dimension: int, scene: Scene, comm: MPI.Intracomm | None
     )
 
 
-def build_quarter(scene: Scene, comm: MPI.Intracomm | None = None) -> Domain:
+def build_quarter(scene: Scene, comm: MPI.Intracomm | None) -> Domain:
     """Mesh the quarter x > 0, y > 0, with one layer along z if all sections are equal."""
     mesh, (around, through, _) = scene.mesh, _counts(scene.mesh)
     counts = around, through, layers(scene)

@@ -33,7 +33,7 @@ class FurtherCase(LoadCaseSolver):
         load_values: Callable[[float], LoadValues],
         stepper: Stepper,
         solver: Solver,
-        kappa: float | Function | None = None,
+        kappa: float | Function | None,
     ):
         self.number, self.state = number, state
         self.load_values = load_values
@@ -87,7 +87,7 @@ def join(
     load_values: Sequence[Callable[[float], LoadValues]],
     weights: Sequence[float],
     solver: Solver,
-    kappa: float | Function | None = None,
+    kappa: float | Function | None,
 ) -> None:
     """Add further load cases to a stepper; `weights` are of all cases, in their order."""
     numbered = enumerate(zip(states, load_values, strict=True), start=2)

@@ -231,7 +231,7 @@ class RemodelingPass(Remodels):
         return float(np.sqrt(self.quadrature.maximum(squared.reshape(self.quadrature.shape))))
 
     def updated_cells(
-        self, time_old: float, time_new: float, residual: float = 0.0, cells: UnitCell | None = None
+        self, time_old: float, time_new: float, residual: float, cells: UnitCell | None = None
     ) -> tuple[UnitCell, Array]:
         """Compute the cells after a pass from `cells` or the present ones, and F_e (n, 3, 3)."""
         # Cells are flattened over the quadrature points. The state does not change.
@@ -255,7 +255,7 @@ class RemodelingPass(Remodels):
     def _averages_targets(self) -> bool:
         return bool(self.further) and MEANS_OF_CASES[self.settings.mean].of_targets
 
-    def without_tension(self, residual: float = 0.0) -> Flags:
+    def without_tension(self, residual: float) -> Flags:
         """Return flags (n,) of points with no or hardly any tension."""
         drive = self.drive(residual)
         if self.law.target is not None:
@@ -304,7 +304,7 @@ class RemodelingPass(Remodels):
         cells.set(*updated[:2])
         return power
 
-    def predict_limit(self, time: float, residual: float = 0.0) -> None:
+    def predict_limit(self, time: float, residual: float) -> None:
         """Store the cells that a pass to t -> infinity would give; `distance` uses them."""
         # The state does not change. `time` is so long that the initial cells no longer matter
         # (`Scene.last_time`); a pass up to `2 * time` therefore reaches the limit.

@@ -718,5 +718,5 @@ class Pause(Watcher):
         if self.deadline is not None and self.comm.rank == 0 and not reason:
             if clock.monotonic() + MARGIN * self._seconds > self.deadline:
                 reason = "stopped before --max-wall-time is over"
-        if reasons := list(filter(None, self.comm.allgather(reason))):
+        if reasons := [text for text in self.comm.allgather(reason) if text]:
             raise Paused(reasons[0], step.time, self.folder)

@@ -423,8 +423,8 @@ class NaturalConfiguration(_KinematicsWrapper):
         self,
         kinematics: Kinematics,
         gradient: Expr,
-        closed_ring: Any = None,
-        initial: Expr | None = None,
+        closed_ring: Any,
+        initial: Expr | None,
     ):
         self.field, self.gradient = kinematics, gradient
         self.closed_ring = closed_ring

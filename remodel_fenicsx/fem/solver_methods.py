@@ -156,7 +156,7 @@ def resolve_auto(method: str, unknowns: int, reduced: bool, multigrid: bool = Tr
     return "direct" if is_small(unknowns, reduced) else LAGGED
 
 
-def method_options(method: str, ranks: int, small: bool = False) -> dict[str, object]:
+def method_options(method: str, ranks: int, small: bool) -> dict[str, object]:
     """Return PETSc options of a method; `small`: for a problem that `is_small`, on one rank."""
     options = dict(SOLVER_METHODS[method].options)
     if small and ranks == 1 and options.get("pc_factor_mat_solver_type") == "mumps":

@@ -292,7 +292,7 @@ def solve_newton(
 
 
 def principal_stresses(
-    tissue: Tissue, stretches: Array, dimensions: Array | None = None
+    tissue: Tissue, stretches: Array, dimensions: Array | None
 ) -> tuple[Array, Array]:
     """Return principal Cauchy stresses (..., 3) and d sigma_i/d ln lambda_j at stretches."""
     # The stretches (..., 3) are along the axes of the cells.

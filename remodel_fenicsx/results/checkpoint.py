@@ -39,8 +39,8 @@ class Checkpoints(Watcher):
         folder: Path,
         state: State,
         scene_text: str,
-        every: int | None = None,
-        before: Sequence[Callable[[], None]] = (),
+        every: int | None,
+        before: Sequence[Callable[[], None]],
     ):
         self.before = before
         self.folder, self.state = folder, state

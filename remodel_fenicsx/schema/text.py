@@ -144,7 +144,7 @@ def merge_nested(base: Mapping[str, object], over: Mapping[str, object]) -> dict
     return result
 
 
-def toml_text(table: BaseModel, header: str = "") -> str:
+def toml_text(table: BaseModel, header: str) -> str:
     """Format a table with all its values as TOML, each key under its description as a comment."""
     head = [f"# {printable(line)}" if line.strip() else "" for line in header.splitlines()]
     return "\n".join([*head, *([""] if head else []), *_lines(table), ""])

@@ -265,7 +265,7 @@ class Equilibrium:
         before: Array,
         after: Array,
         share: float,
-        nearer_than: float = 0.0,
+        nearer_than: float,
     ) -> bool:
         """Return whether every point keeps a fraction of its 1 - r/L. Collective."""
         lost = bool(np.any((after > nearer_than) & (1 - after < share * (1 - before))))
