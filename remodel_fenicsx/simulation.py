@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
 from functools import partial
 
 from dolfinx.fem import Function
@@ -96,14 +95,14 @@ class Simulation:
                 "preset_scene(PAPER, BODY) for a preset"
             )
         restore_signal_handlers()
-        parts = build(scene, comm, domain, coupling)
-        self.scene, self.domain = parts.scene, parts.domain
-        self.stepper, self.observer = parts.stepper, parts.observer
-        self.state, self.time_stepping = self.stepper.state, parts.time_stepping
+        self.scene, self.domain, self.stepper, self.observer, self.time_stepping = build(
+            scene, comm, domain, coupling
+        )
+        self.state = self.stepper.state
         self.unknown, self.cells = self.state.unknown, self.state.cells
         self.loading = self.state.loading
         self.quadrature, self.tissue = self.cells.quadrature, self.stepper.tissue
-        self.watchers = watchers(self.scene, parts)
+        self.watchers = watchers(self.scene, self.stepper, self.observer)
 
     def load_values(self, time: float, case: int = 0) -> LoadValues:
         """Return the magnitudes of all loads at a time.
@@ -148,24 +147,13 @@ class Simulation:
         self.stepper.close()
 
 
-@dataclass(frozen=True)
-class SimulationParts:
-    """Components of a simulation: resolved scene, mesh, stepper, observer and time stepping."""
-
-    scene: Scene
-    domain: Domain
-    stepper: Stepper
-    observer: Observer
-    time_stepping: TimeStepping  # `FixedSteps`, `StepControl` or `Homeostasis`
-
-
 def build(
     scene: Scene,
     comm: MPI.Intracomm,
-    domain: Domain | None = None,
-    coupling: CouplingFactory | None = None,
-) -> SimulationParts:
-    """Build mesh, states, stepper and observer of a scene, in this order. Collective."""
+    domain: Domain | None,
+    coupling: CouplingFactory | None,
+) -> tuple[Scene, Domain, Stepper, Observer, TimeStepping]:
+    """Return the resolved scene, mesh, stepper, observer and time stepping. Collective."""
     scene, domain = meshed(scene, comm, domain)
     fibres = measured_fibres(scene, domain)
     state, *further_states = initial_states(scene, domain, fibres)
@@ -186,13 +174,8 @@ def build(
         load_cases.join(stepper, further_states, further_loads, weights, solver, kappa)
     time_stepping = _time_stepping(scene, stepper)
     additional_columns = {TIME_ERROR} - {*scene.output.columns} if scene.time.is_adaptive else set()
-    return SimulationParts(
-        scene,
-        domain,
-        stepper,
-        Observer(scene.geometry, stepper, scene.columns(additional_columns)),
-        time_stepping,
-    )
+    observer = Observer(scene.geometry, stepper, scene.columns(additional_columns))
+    return scene, domain, stepper, observer, time_stepping
 
 
 def _solver(scene: Scene) -> Solver:
@@ -248,13 +231,13 @@ def _time_stepping(scene: Scene, stepper: Stepper) -> TimeStepping:
     return homeostasis.Homeostasis(stepper, plan)
 
 
-def watchers(scene: Scene, parts: SimulationParts) -> list[Watcher]:
+def watchers(scene: Scene, stepper: Stepper, observer: Observer) -> list[Watcher]:
     """Return the watchers in order; each load case checks its stability before its warnings."""
-    stepper, unstable = parts.stepper, scene.solver.unstable
+    unstable = scene.solver.unstable
     counted = "negative_eigenvalues" in scene.output.columns
     candidates: list[Watcher | None] = [
         EquilibriumStability(stepper, unstable, every_step=counted),
-        parts.observer,
+        observer,
     ]
     candidates += [kind.make(scene, stepper) for kind in WATCHERS.values()]
     candidates += [
