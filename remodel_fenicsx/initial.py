@@ -67,7 +67,7 @@ def meshed(scene: Scene, comm: MPI.Intracomm, domain: Domain | None) -> tuple[Sc
             describe_choice(scene) if scene.model.kinematics == AUTO else only_for_means(scene)
         ):
             log.info("%s", line)
-    if scene.mesh.formulation == AUTO and comm.rank == 0:
+    if scene.mesh.formulation == AUTO:
         log.info("%s", scene.describe_formulation())
     scene = resolve_auto_settings(scene, domain)
     return scene, checked_domain(mesh_of(scene, comm) if domain is None else domain, scene)

@@ -162,7 +162,7 @@ def build(
     tissue, kappa = parameters_of(scene.properties(), domain)
     solver = _solver(scene)
     loads, *further_loads = (partial(values_of_loads, case.loads) for case in scene.each_case())
-    stepper = Stepper(state, tissue, _remodeling(scene, comm), solver, loads, coupling, kappa)
+    stepper = Stepper(state, tissue, _remodeling(scene), solver, loads, coupling, kappa)
     for process in stepper.remodels:
         process.set_initial(
             partial(field_from_files, fibres, quadrature=state.cells.quadrature, domain=domain)
@@ -187,17 +187,16 @@ def _solver(scene: Scene) -> Solver:
     return solver
 
 
-def _remodeling(scene: Scene, comm: MPI.Intracomm) -> Remodeling:
+def _remodeling(scene: Scene) -> Remodeling:
     """Return the remodeling settings, with 'relaxed' if the path to a steady state oscillates."""
     # When the driver's principal values change their order, random cells jump, however small the
     # step, and the passes oscillate.
     if not (scene.time.is_equilibrium and scene.has_random_cells and scene.cell_order_can_change):
         return scene.remodeling
-    if comm.rank == 0:
-        log.info(
-            "the path to the steady state uses the coupling 'relaxed', because random cells would "
-            "otherwise oscillate"
-        )
+    log.info(
+        "the path to the steady state uses the coupling 'relaxed', because random cells would "
+        "otherwise oscillate"
+    )
     return scene.remodeling.model_copy(update={"coupling": "relaxed"})
 
 

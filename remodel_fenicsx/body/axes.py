@@ -231,8 +231,7 @@ def compute_local_axes(domain: Domain, quadrature: Quadrature) -> LocalAxes:
                 f"geometry.faces: the local axes are {words}; must be at most "
                 f"{100 * MOST_UNDEFINED:g} %. Is there an outer face opposite the inner one?"
             )
-        if domain.comm.rank == 0:
-            log.info("the local axes are %s; using those of the nearest point there", words)
+        log.info("the local axes are %s; using those of the nearest point there", words)
         _fill(axes, known, quadrature)
     depth, station = (_share(values[..., k], values[..., k + 1]) for k in (6, 8))
     dofs = dof_of_node(domain.mesh, lengths[0].function_space)

@@ -469,11 +469,8 @@ class FileBody(WithRegions, FromFile):
         self.check_faces(domain, supports, loads)
         length = domain.length()
         unit = f" {self.length_unit}" if self.length_unit else ""
-        if domain.comm.rank == 0:
-            words = f"{self.thickness_in_words} {domain.thickness:.6g}{unit}"
-            log.info(
-                "%s%s", words, f"; length from inlet to outlet {length:.6g}{unit}" if length else ""
-            )
+        words = f"; length from inlet to outlet {length:.6g}{unit}" if length else ""
+        log.info("%s %.6g%s%s", self.thickness_in_words, domain.thickness, unit, words)
         on_faces = faces_of(loads)
         ways = {on.face: (name, 1.0) for name, on in on_faces.items() if on.kind == "displacement"}
         if "elongation" in loads:

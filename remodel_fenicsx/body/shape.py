@@ -249,9 +249,8 @@ def _largest_principal_stress(m: Measurement) -> Array:
 def _max_principal_stress(m: Measurement) -> float:
     stress = _largest_principal_stress(m)
     largest, position = m.quadrature.maximum(stress), m.quadrature.shown_place_of_largest(stress)
-    if m.domain.comm.rank == 0:
-        text = "time %g: largest principal stress %.6g at the reference position %s"
-        log.info(text, m.step.time, largest, position)
+    text = "time %g: largest principal stress %.6g at the reference position %s"
+    log.info(text, m.step.time, largest, position)
     return largest
 
 

@@ -565,7 +565,7 @@ class Extrapolated(Staggered):
                 target.where(lost, target_from_records(self._newest)), duration
             )
         points = count_points(self.state, lost)
-        if points and self.state.comm.rank == 0:
+        if points:
             log.info("time %g: %d points use the last target, without extrapolation", time, points)
         self._power = self.remodeling.replace(cells, self.state.elastic_gradient(), duration)
 
