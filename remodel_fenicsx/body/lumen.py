@@ -85,10 +85,7 @@ def oriented(surface: Surface, name: str) -> Surface:
         point_normals=False, split_vertices=False, auto_orient_normals=False
     )
     points, triangles = surface.points, normals.faces.reshape(-1, 4)[:, 1:].astype(np.int64)
-    volume, area = (
-        _signed_volume(points, triangles),
-        np.linalg.norm(area_vectors(points[triangles]), axis=1).sum(),
-    )
+    volume, area = _signed_volume(points, triangles), _area(points, triangles)
     if abs(volume) <= HOLLOW * area**1.5:
         raise SceneError(f"{name}: the surface is flat and encloses no lumen")
     if volume < 0:
@@ -101,6 +98,16 @@ def _signed_volume(points: Array, triangles: Integers) -> float:
     places = points[triangles]
     sides = np.einsum("ni,ni->", places.mean(axis=1), area_vectors(places)) / 3
     return float(sides + sum(cap_volume(points, rim[:, ::-1]) for rim in rims(triangles)))
+
+
+def _area(points: Array, triangles: Integers) -> float:
+    return float(np.linalg.norm(area_vectors(points[triangles]), axis=1).sum())
+
+
+def _mean_radius(surface: Surface) -> float:
+    """Return the lumen's mean radius, that of a tube of the same volume and area."""
+    volume = _signed_volume(surface.points, surface.triangles)
+    return 2 * volume / _area(surface.points, surface.triangles)
 
 
 def remeshed(surface: Surface, size: float) -> tuple[Surface, Integers]:
@@ -195,9 +202,7 @@ def extrude_wall(
 
     Each layer has its fraction of the thickness.
     """
-    ends, counts = np.cumsum([0.0, *layers.values()]), shared_out(
-        [*layers.values()], max(through, len(layers))
-    )
+    ends, counts = np.cumsum([0.0, *layers.values()]), shared_out([*layers.values()], through)
     levels = Wall((*layers,), (*ends,), counts).nodes(1) / ends[-1]
     openings = rims(surface.triangles)
     size, layer = len(surface.points), np.arange(len(levels) - 1)[:, None, None]
@@ -313,8 +318,7 @@ def _thinned(surface: Surface, faulty: Flags, allowed: Array, thickness: Array) 
     """Return a smaller thickness at faulty points, which grows around them by a slope."""
     worst = np.flatnonzero(faulty)[np.argmin((allowed / thickness)[faulty])]
     place = format_position(surface.points[worst])
-    area = np.linalg.norm(area_vectors(surface.points[surface.triangles]), axis=1).sum()
-    radius = 2 * _signed_volume(surface.points, surface.triangles) / area
+    radius = _mean_radius(surface)
     if thickness[worst] > radius or allowed[worst] < LEAST_THINNED * thickness[worst]:
         raise SceneError(
             f"--thickness: too thick: the wall folds or meets itself at {place}, also with a "
@@ -352,38 +356,31 @@ def write_wall(
     if not 1 <= through <= MOST_THROUGH:
         raise SceneError(f"--through: must be an integer from 1 to {MOST_THROUGH}")
     shares, read = _thicknesses(layers), read_surface(surface)
-    area = np.linalg.norm(area_vectors(read.points[read.triangles]), axis=1).sum()
-    number = (
-        3 * max(through, len(shares)) * area / (np.sqrt(0.1875) * size**2)
-    )  # for equilateral triangles
+    through = max(through, len(shares))
+    area = _area(read.points, read.triangles)
+    number = 3 * through * area / (np.sqrt(0.1875) * size**2)  # for equilateral triangles
     if number > LARGEST_MESH:
         raise SceneError(
             f"--size {size:g}: about {number:.2g} tetrahedra; must be at most {LARGEST_MESH:g}"
         )
-    depth, radius = (
-        _thickness(thickness, shares, read),
-        2 * _signed_volume(read.points, read.triangles) / area,
-    )
-    _check_units(radius, size, depth)
+    depth = _thickness(thickness, shares, read)
+    _check_units(_mean_radius(read), size, depth)
     if len(read.triangles) > LARGE_SURFACE:
         announce(f"{surface}: remeshing {len(read.triangles)} triangles takes minutes")
     divided, near = remeshed(read, size)
     requested = depth[near]
-    wall = extrude_wall(divided, read, requested, shares or {"wall": 1.0}, through)
+    layered = shares or {"wall": 1.0}
+    wall = extrude_wall(divided, read, requested, layered, through)
     if taken := shares.keys() & wall.faces:
         raise SceneError(f"--layers {min(taken)}=...: a face has this name; rename the layer")
-    names = list(shares) or ["wall"]
     of_names = {2: {name: number for number, name in enumerate(wall.faces, 1)}}
-    of_names[3] = {name: number for number, name in enumerate(names, len(wall.faces) + 1)}
+    of_names[3] = {name: number for number, name in enumerate(layered, len(wall.faces) + 1)}
     blocks = [
         Block("triangle6", np.full(len(face), of_names[2][name]), face)
         for name, face in wall.faces.items()
     ]
-    blocks += [
-        Block(
-            "tetra10", len(wall.faces) + 1 + wall.layers, in_gmsh_order("tetra10", wall.tetrahedra)
-        )
-    ]
+    tetrahedra = in_gmsh_order("tetra10", wall.tetrahedra)
+    blocks.append(Block("tetra10", len(wall.faces) + 1 + wall.layers, tetrahedra))
     write_new(path, gmsh_text(wall.points, blocks, of_names).encode())
     inner, outer = (wall.faces[name] for name in ("inner", "outer"))
     nodes = np.unique(outer)
@@ -391,11 +388,10 @@ def write_wall(
         wall.points[nodes] - nearest(wall.points, _halved(inner), wall.points[nodes])[1], axis=1
     )
     lines = [
-        f"{path}: {len(wall.tetrahedra)} tetrahedra of degree 2, "
-        f"{max(through, len(names))} through the wall",
+        f"{path}: {len(wall.tetrahedra)} tetrahedra of degree 2, " f"{through} through the wall",
         f"thickness {between.min():.4g} to {between.max():.4g} at the nodes",
         f"faces {', '.join(wall.faces)}; "
-        + (f"regions {', '.join(names)}" if shares else "one region"),
+        + (f"regions {', '.join(shares)}" if shares else "one region"),
     ]
     if (thinner := wall.allowed < requested).any():
         thinnest = int(np.argmin(wall.allowed / requested))
