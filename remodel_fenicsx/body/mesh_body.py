@@ -70,6 +70,7 @@ if TYPE_CHECKING:
 log = logging.getLogger(__name__)
 
 HELD_ACROSS = ("guided", "sliding", "held")  # kinds of support that prevent motion along the normal
+ABLE = " or ".join(map(repr, HELD_ACROSS))
 ON_FACES: dict[str, Callable[[str], LoadKind]] = {
     "pressure": lambda face: LoadKind(
         _by_hold_faces, f"pressure on the deformed face {face}", STRESS
@@ -420,11 +421,10 @@ class FileBody(WithRegions, FromFile):
 
     def check_faces(self, domain: Domain, supports: Supports, loads: Loads) -> None:
         """Check that the faces exist, no rigid motion is free, and loads fit the supports."""
+        lacking = f"the body has no such face; it has {', '.join(domain.faces)}"
         for name in supports:
             if name not in domain.faces:
-                raise SceneError(
-                    f"supports.{name}: the body has no such face; it has {', '.join(domain.faces)}"
-                )
+                raise SceneError(f"supports.{name}: {lacking}")
         from remodel_fenicsx.body.mesh_domain import check_supports
 
         chosen = self.supports_of(supports)
@@ -436,14 +436,11 @@ class FileBody(WithRegions, FromFile):
                 chosen.get(face, Support(kind="free")).kind,
             )
             if face not in domain.faces:
-                raise SceneError(
-                    f"{key}: the body has no such face; it has {', '.join(domain.faces)}"
-                )
+                raise SceneError(f"{key}: {lacking}")
             if load == "displacement":
                 if kind not in HELD_ACROSS:
-                    able = " or ".join(map(repr, HELD_ACROSS))
                     rule = f"its support ({kind!r}) lets it move"
-                    raise SceneError(f"{key}: {rule}; a face that is displaced must be {able}")
+                    raise SceneError(f"{key}: {rule}; a face that is displaced must be {ABLE}")
                 if domain.boundary.goes_around(face):  # type: ignore[attr-defined]
                     raise SceneError(
                         f"{key}: this face goes around the body, so that it has no mean normal, "
@@ -626,8 +623,7 @@ class MeshBody(WalledMesh, Unloads, FileBody):
             return
         for face in ENDS:
             if (kind := self.supports_of(supports)[face].kind) not in HELD_ACROSS:
-                able = " or ".join(map(repr, HELD_ACROSS))
-                rule = f"must be {able} with loads.{LUMEN}: the lumen is closed by plane ends"
+                rule = f"must be {ABLE} with loads.{LUMEN}: the lumen is closed by plane ends"
                 raise SceneError(f"supports.{face}.kind = {kind!r}: {rule}")
         moved = [name for name, on in faces_of(loads).items() if on.kind == "displacement"]
         moved += {"elongation"} & {*loads}

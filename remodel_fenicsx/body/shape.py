@@ -11,7 +11,7 @@ from abc import abstractmethod
 from collections.abc import Callable, Collection, Container, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
-from operator import attrgetter
+from operator import attrgetter, methodcaller
 from pathlib import Path
 from typing import Any, ClassVar, Literal, NamedTuple, TYPE_CHECKING, TypeVar
 
@@ -412,21 +412,14 @@ def columns_on_request(
         Column(
             f"support_force_{face}",
             "force",
-            SUPPORT_FORCE.format(face),
-            partial(_support_force, face),
+            f"force of the support on the face `{face}`, along the face's mean outward normal",
+            methodcaller("support_force", face),
         )
         for face in held
         if re.fullmatch(NAME, face)
     ]
     requestable = (*shape.columns_on_request, *of_regions, *of_supports)
     return COLUMNS_ON_REQUEST | {column.name: column for column in requestable}
-
-
-SUPPORT_FORCE = "force of the support on the face `{}`, along the face's mean outward normal"
-
-
-def _support_force(face: str, m: Any) -> float:
-    return float(m.support_force(face))
 
 
 @with_old_names

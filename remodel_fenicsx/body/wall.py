@@ -128,15 +128,11 @@ def prestretch(natural: Natural, local_axes: LocalAxes, domain: Domain) -> Array
     depth = local_axes.depth
     stretches = np.ones((*depth.shape, 3))
     for layer in natural.layers:
+        low, high = layer.share
+        chosen = (depth >= low) & ((depth < high) | (high == 1.0))
         if layer.region is not None:
-            stretches[domain.element_region == domain.regions[layer.region]] = (
-                layer.prestretch.stretches
-            )
-        else:
-            low, high = layer.share
-            stretches[(depth >= low) & ((depth < high) | (high == 1.0))] = (
-                layer.prestretch.stretches
-            )
+            chosen = domain.element_region == domain.regions[layer.region]
+        stretches[chosen] = layer.prestretch.stretches
     return stretches
 
 
