@@ -409,7 +409,9 @@ class _KinematicsWrapper:
             raise AttributeError(name)
         return getattr(self.field, name)
 
-    elastic_gradient = Kinematics.elastic_gradient  # of this F, not of that of the field
+    def elastic_gradient(self, unknown: Function) -> Expr:
+        """Return F_e, UFL: the deformation gradient of the tissue."""
+        return self.elastic(self.deformation_gradient(unknown))
 
 
 @with_old_names
