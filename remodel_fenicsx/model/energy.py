@@ -675,8 +675,7 @@ class Tissue:
             One whole cell, or cells whose weights add up to one.
         """
         F = ufl.variable(deformation_gradient)
-        stresses = _stresses(F, ufl.diff(self.strain_energy(F, cells), F))
-        return stresses._replace(collagen=self._collagen_stresses(F, cells))
+        return self._stresses(F, ufl.diff(self.strain_energy(F, cells), F), cells)
 
     def stresses_of_parts(
         self, deformation_gradient: UflOrArray, cells: Sequence[UnitCell], jacobian: UflOrArray
@@ -684,14 +683,17 @@ class Tissue:
         """Return stresses with U at the given J: P = d(W - U)/dF + J U'(J) F^-T; UFL."""
         F, J = ufl.variable(deformation_gradient), ufl.variable(jacobian)
         pressure = J * ufl.diff(self.volumetric_energy(J), J)
-        stresses = _stresses(
-            F, ufl.diff(self.distortional_energy(F, cells), F) + pressure * ufl.inv(F).T
-        )
-        return stresses._replace(collagen=self._collagen_stresses(F, cells))
+        distortional = ufl.diff(self.distortional_energy(F, cells), F)
+        return self._stresses(F, distortional + pressure * ufl.inv(F).T, cells)
 
-    def _collagen_stresses(self, F: UflOrArray, cells: Sequence[UnitCell]) -> Stresses:
-        energy = self._with_network(0.0 * ufl.tr(F), F, cells)
-        return _stresses(F, ufl.diff(energy, F))
+    def _stresses(self, F: UflOrArray, first: UflOrArray, cells: Sequence[UnitCell]) -> Stresses:
+        """Return all stresses from P, with those of the network; UFL."""
+        of_network = ufl.diff(self._with_network(0.0 * ufl.tr(F), F, cells), F)
+        whole, collagen = (
+            Stresses(P, ufl.dot(ufl.inv(F), P), ufl.dot(P, F.T) / ufl.det(F))
+            for P in (first, of_network)
+        )
+        return whole._replace(collagen=collagen)
 
     def energy_increment(
         self, deformation_gradient: UflOrArray, old: UnitCell, new: UnitCell
@@ -746,8 +748,3 @@ class Tissue:
             self.current_modulus * self.chain.stiffness(length, self.contour_length) * length**2
         )
         return self._with_network(0.0, F, cells) * content - tension * natural_length
-
-
-def _stresses(F: UflOrArray, first: UflOrArray) -> Stresses:
-    """Return all stresses from P; UFL."""
-    return Stresses(first, ufl.dot(ufl.inv(F), first), ufl.dot(first, F.T) / ufl.det(F))
