@@ -156,10 +156,9 @@ def natural_gradient(
             )
     if isinstance(shape, RoundWall):
         tissues = {name: properties.tissue for name, properties in scene.properties().items()}
+        layers = shape.layers_of_tissue(natural, scene.regions, tissues)
         try:
-            ring = close_ring(
-                shape.layers_of_tissue(natural, scene.regions, tissues), natural.opening_angle
-            )
+            ring = close_ring(layers, natural.opening_angle)
         except ArithmeticError as error:
             angle = f"natural.opening_angle = {natural.opening_angle:g}"
             raise SceneError(

@@ -242,17 +242,18 @@ def _inverse_elastostatics(scene: Scene, given: Array, share: float) -> Array:
 def _load_forward(scene: Scene, comm: MPI.Intracomm, numbers: Array, share: float) -> Array:
     """Return radii and length of a forward run at a load factor. Collective."""
     end = scene.end_of_ramps or 1.0
-    changes: dict[str, object] = {"output.columns": [], "output.times": [], "output.fields": False}
+    changes: dict[str, object] = {
+        "output.columns": [],
+        "output.times": [],
+        "output.fields": False,
+        "time.end": EQUILIBRIUM,
+        "solver.relative_tolerance": min(scene.solver.relative_tolerance, GEOMETRY_TOLERANCE / 10),
+    }
     if scene.natural.cells == AS_GIVEN:
         changes |= PASSIVE | {"time.end": end, "time.step": end / LOAD_STEPS}
-    else:
-        changes |= {"time.end": EQUILIBRIUM}
-    changes |= {
-        "solver.relative_tolerance": min(scene.solver.relative_tolerance, GEOMETRY_TOLERANCE / 10)
-    }
     for name, load in scene.loads.items():
-        changes |= {f"loads.{name}.value": load.value * load.factor(end) * share}
-        changes |= {f"loads.{name}.ramp": [[0.0, 0.0], [end, 1.0]]}
+        changes[f"loads.{name}.value"] = load.value * load.factor(end) * share
+        changes[f"loads.{name}.ramp"] = [[0.0, 0.0], [end, 1.0]]
     with (
         muted_warnings(),
         contextlib.closing(
@@ -279,12 +280,13 @@ def _load_forward(scene: Scene, comm: MPI.Intracomm, numbers: Array, share: floa
 
 def _with_dimensions(scene: Scene, numbers: Array) -> Scene:
     """Return the scene of an unloaded tube with these radii (inner to outer) and length."""
-    changes: dict[str, object] = {"geometry.is": "unloaded", "natural.cells": AS_GIVEN}
-    changes |= {
+    changes: dict[str, object] = {
+        "geometry.is": "unloaded",
+        "natural.cells": AS_GIVEN,
         "geometry.inner_radius": float(numbers[0]),
         "geometry.outer_radius": float(numbers[-2]),
+        "geometry.length": float(numbers[-1]),
     }
-    changes |= {"geometry.length": float(numbers[-1])}
     for name, radius in zip(_outer_radii(scene), numbers[1:-1], strict=False):
         changes[f"regions.{name}.outer_radius"] = float(radius)
     return scene.with_values(changes)
@@ -340,9 +342,11 @@ def unloaded_mesh(scene: Scene, comm: MPI.Intracomm, folder: Path, said: Said) -
     changes: dict[str, object] = {
         "geometry.is": "unloaded",
         "geometry.file": str(path),
+        "geometry.file_unit": None,
+        "geometry.tags": None,
+        "geometry.sha256": None,
         "mesh.refinement": 1,
     }
-    changes |= {"geometry.file_unit": None, "geometry.tags": None, "geometry.sha256": None}
     if shape.regions:
         numbers: dict[str, int] = comm.bcast(regions)
         changes["geometry.regions"] = {name: [numbers[name]] for name in shape.regions}

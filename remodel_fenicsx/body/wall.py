@@ -374,13 +374,8 @@ class RoundWall(Walled, WithRegions, Unloads):
                 )
             ]
             tissue = tissues[region if region in tissues else ""]
-            layers.append(
-                Layer(
-                    (low, high),
-                    tissue,
-                    (*of_layer, UNSTRETCHED)[0] * fresh_stretches(tissue),
-                )
-            )
+            stretches = (*of_layer, UNSTRETCHED)[0] * fresh_stretches(tissue)
+            layers.append(Layer((low, high), tissue, stretches))
         return layers
 
     def covers_body(self, regions: Collection[str]) -> bool:
