@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from functools import partial
 from typing import TYPE_CHECKING, Annotated, Literal
 
 import numpy as np
@@ -119,9 +120,9 @@ class Tendon(WithAxes):
         """
         from remodel_fenicsx.body.domain import build_domain
 
-        def draw() -> None:
-            draw_tendon(self.length, self.area, mesh.refinement, mesh.element, mesh.degree)
-
+        draw = partial(
+            draw_tendon, self.length, self.area, mesh.refinement, mesh.element, mesh.degree
+        )
         radius = outer_radius(self.area, mesh.refinement, mesh.degree)
         return build_domain(draw, self.name, _dimensions(self.length, self.area, radius), comm)
 

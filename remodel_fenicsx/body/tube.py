@@ -598,10 +598,7 @@ def whole_tube(
 
     around, through, along = counts
     wall = shape.wall(through, regions or {})
-
-    def draw() -> None:
-        draw_tube(wall, shape.length, (around, along), element, degree, quarters)
-
+    draw = partial(draw_tube, wall, shape.length, (around, along), element, degree, quarters)
     return wall.marked(build_domain(draw, shape.name, _dimensions(shape), comm))
 
 

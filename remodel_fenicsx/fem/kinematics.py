@@ -337,8 +337,7 @@ class PointKinematics(_Reduced):
     def unknown(self, mesh: Mesh, degree: int) -> Function:
         """Return three numbers on the only element, zero."""
         self._nodes = lagrange(mesh, degree, ()).function_space
-        element = basix_ufl.element("DG", mesh.topology.cell_name(), 0, shape=(3,))
-        return fem.Function(fem.functionspace(mesh, element), name="displacement")
+        return lagrange(mesh, 0, (3,), "DG")
 
     def displacement(self, unknown: Function) -> Expr:
         """Return u_i x_i / length."""
@@ -613,9 +612,9 @@ def field_degree(space: FunctionSpace) -> int:
 # ---------------------------------------------------------------- building blocks
 
 
-def lagrange(mesh: Mesh, degree: int, shape: tuple[int, ...]) -> Function:
-    """Return a continuous function "displacement", zero, with values of this shape."""
-    element = basix_ufl.element("Lagrange", mesh.topology.cell_name(), degree, shape=shape)
+def lagrange(mesh: Mesh, degree: int, shape: tuple[int, ...], family: str = "Lagrange") -> Function:
+    """Return a function "displacement", zero, with values of this shape; by default continuous."""
+    element = basix_ufl.element(family, mesh.topology.cell_name(), degree, shape=shape)
     return fem.Function(fem.functionspace(mesh, element), name="displacement")
 
 

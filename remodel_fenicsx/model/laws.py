@@ -572,14 +572,8 @@ class TurnoverRule(NamedTuple):
 
     def rates(self, tissue: Tissue, stretch: Array) -> TurnoverRates:
         """Return the rates at the stretch lambda_e (n,) of chains."""
-        chain = tissue.chain
-        r0, contour = tissue.end_to_end_length, tissue.contour_length
-        assert chain is not None
-        return self.followed.rates(
-            self,
-            lambda lambda_e: chain.stiffness(lambda_e * r0, contour) * lambda_e,
-            stretch,
-        )
+        secant = _secant(tissue)
+        return self.followed.rates(self, lambda lambda_e: secant(lambda_e) * lambda_e, stretch)
 
     def at_length(self, tissue: Tissue, length: Array) -> TurnoverRates:
         """Return the rates at the length r (n,) of chains."""
@@ -591,11 +585,8 @@ class TurnoverRule(NamedTuple):
         # ln(g - g0/lambda^2)/d ln lambda at lambda_h, the slope for chains and repulsion together.
         # The parameters of the tissue must be numbers.
         deposited = self.deposition_stretch * (1.0 + 1j * COMPLEX_STEP)
-        chain = tissue.chain
-        r0, contour = tissue.end_to_end_length, tissue.contour_length
-        assert chain is not None
-        secant = chain.stiffness(deposited * r0, contour)
-        total_force = secant - chain.stiffness(r0, contour) / deposited**2
+        secant = _secant(tissue)(deposited)
+        total_force = secant - _secant(tissue)(1.0) / deposited**2
         stimulus = secant * deposited**self.followed.power
         stimulus_slope, force_slope = (
             float(np.log(value).imag) / COMPLEX_STEP for value in (stimulus, total_force)
@@ -603,6 +594,13 @@ class TurnoverRule(NamedTuple):
         return self.gain * stimulus_slope, force_slope * self.time / (
             self.gain * stimulus_slope - 2
         )
+
+
+def _secant(tissue: Tissue) -> Tension:
+    """Return g(lambda r0), the secant stiffness of chains, as a function of lambda."""
+    chain, r0, contour = tissue.chain, tissue.end_to_end_length, tissue.contour_length
+    assert chain is not None
+    return lambda stretch: chain.stiffness(stretch * r0, contour)
 
 
 def by_stress(rule: TurnoverRule, tension: Tension, stretch: Array) -> TurnoverRates:

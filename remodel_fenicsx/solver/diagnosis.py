@@ -253,13 +253,8 @@ class FailureCause:
     finding: str = ""
 
     def __str__(self) -> str:
-        if not self.kind:
-            return self.advice
-        return (
-            f"{self.kind} ({self.finding}): {self.advice}"
-            if self.finding
-            else f"{self.kind}: {self.advice}"
-        )
+        finding = f" ({self.finding})" if self.finding else ""
+        return f"{self.kind}{finding}: {self.advice}" if self.kind else self.advice
 
 
 TOO_LARGE = FailureCause("", "try a smaller time.step, a slower ramp or lower loads")
