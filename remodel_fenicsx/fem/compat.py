@@ -22,8 +22,7 @@ def mesh_from_gmsh(model: Any, comm: MPI.Intracomm) -> tuple[Mesh, MeshTags, Mes
         from dolfinx.io import gmshio as reader  # type: ignore[attr-defined,no-redef]  # 0.9
     # 0.9 returns (mesh, cell tags, facet tags), later versions a longer named tuple that starts
     # with the same three
-    mesh, cell_tags, facet_tags = reader.model_to_mesh(model, comm, 0, gdim=3)[:3]
-    return mesh, cell_tags, facet_tags
+    return reader.model_to_mesh(model, comm, 0, gdim=3)[:3]
 
 
 def geometry_dofmap(mesh: Mesh) -> Any:

@@ -71,9 +71,7 @@ def structure_tensor(dimensions: Array, axes: Array) -> Array:
 
 def global_axes(coordinates: Array) -> Array:
     """Return the axes x, y, z as rows, (..., 3, 3), at coordinates (..., 3)."""
-    axes = np.zeros((*coordinates.shape[:-1], 3, 3))
-    axes[...] = np.eye(3)
-    return axes
+    return np.tile(np.eye(3), (*coordinates.shape[:-1], 1, 1))
 
 
 def turned_about_z(axes: Array, angle: float) -> Array:
@@ -85,17 +83,12 @@ def turned_about_z(axes: Array, angle: float) -> Array:
 def cylindrical_axes(coordinates: Array) -> Array:
     """Return circumferential, axial and radial direction about z as rows, (..., 3, 3)."""
     axes = np.zeros((*coordinates.shape[:-1], 3, 3))
-    radial = radial_direction(coordinates)
+    radius = np.sqrt(coordinates[..., 0] ** 2 + coordinates[..., 1] ** 2)
+    radial = coordinates[..., :2] / radius[..., None]
     axes[..., 0, 0], axes[..., 0, 1] = -radial[..., 1], radial[..., 0]
     axes[..., 1, 2] = 1.0
-    axes[..., 2, :] = radial
+    axes[..., 2, :2] = radial
     return axes
-
-
-def radial_direction(coordinates: Array) -> Array:
-    """Return unit vectors away from the z axis at coordinates (..., 3)."""
-    radius = np.sqrt(coordinates[..., 0] ** 2 + coordinates[..., 1] ** 2)[..., None]
-    return np.concatenate([coordinates[..., :2] / radius, np.zeros_like(radius)], axis=-1)
 
 
 def angle_to_axis(dimensions: Array, axes: Array, direction: Array) -> Array:

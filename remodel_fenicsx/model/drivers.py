@@ -8,7 +8,6 @@ from dataclasses import dataclass
 import numpy as np
 
 from remodel_fenicsx._lazy import Late
-from remodel_fenicsx.model import tensors
 from remodel_fenicsx.model.chains import UflOrArray
 from remodel_fenicsx.model.energy import Stresses
 from remodel_fenicsx.model.tensors import Array
@@ -54,11 +53,6 @@ class Driver:
     over_corrects: bool = False
 
 
-def finger_tensor(deformation_gradient: UflOrArray, stresses: Stresses) -> UflOrArray:
-    """Return b = F F^T (UFL)."""
-    return ufl.dot(deformation_gradient, deformation_gradient.T)
-
-
 DRIVERS: dict[str, Driver] = {
     "cauchy": Driver(lambda F, s: s.cauchy, material=False),
     "pk2": Driver(
@@ -67,7 +61,7 @@ DRIVERS: dict[str, Driver] = {
         over_corrects=True,
     ),
     "finger": Driver(
-        finger_tensor,
+        lambda F, s: ufl.dot(F, F.T),  # b
         material=False,
         is_stress=False,
         over_corrects=True,
@@ -77,7 +71,7 @@ DRIVERS: dict[str, Driver] = {
 
 def corotational_tensor(F: Array, spatial_tensor: Array) -> Array:
     """Return R^T t R (n, 3, 3), R of F = R U; U S U / J for t = sigma, C for t = b; objective."""
-    squared, basis = tensors.eigen(np.swapaxes(F, 1, 2) @ F)
+    squared, basis = np.linalg.eigh(np.swapaxes(F, 1, 2) @ F)
     R = F @ (basis / np.sqrt(squared)[:, None, :]) @ np.swapaxes(basis, 1, 2)  # F U^-1
     rotated: Array = np.swapaxes(R, 1, 2) @ spatial_tensor @ R
     return (rotated + np.swapaxes(rotated, 1, 2)) / 2
@@ -120,11 +114,6 @@ class Frame:
     tensor: Callable[[Array, Array], Array] = corotational_tensor
 
 
-def spatial_frame(F: Array, spatial_axes: Array) -> Array:
-    """Return n_I = m_I as printed in eq. (9): spatial eigenvectors; not objective (erratum 4)."""
-    return spatial_axes
-
-
 def material_frame(F: Array, spatial_axes: Array) -> Array:
     """Return n_1 ~ F^-1 m_1, n_2 ~ F^-1 m_2 orthogonal to n_1, n_3 = n_1 x n_2; objective."""
     # The deformation maps the fibre n_1 onto the first principal direction. F (n, 3, 3); rows
@@ -138,7 +127,8 @@ def material_frame(F: Array, spatial_axes: Array) -> Array:
 
 FRAMES: dict[str, Frame] = {
     "material": Frame(material_frame, carries_axes=True),
-    "spatial": Frame(spatial_frame, carries_axes=False, tensor=lambda F, tensor: tensor),
+    # n_I = m_I as printed in eq. (9): spatial eigenvectors; not objective (erratum 4).
+    "spatial": Frame(lambda F, axes: axes, carries_axes=False, tensor=lambda F, tensor: tensor),
 }
 
 

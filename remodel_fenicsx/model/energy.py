@@ -284,7 +284,7 @@ def total_structure_tensor(cells: Sequence[UnitCell]) -> Array:
 
 def log_derivatives(C: Array, A: Array, second: bool = True) -> tuple[Array, Array | None]:
     """Return dM/dC (n, 3, 3) and, if `second`, d^2M/dC^2 (n, 6, 6) of M = A : ln C."""
-    values, vectors = tensors.eigen(C)
+    values, vectors = np.linalg.eigh(C)
     components = tensors.rotated(A, vectors)
     transposed = np.swapaxes(vectors, -1, -2)
     first = tensors.rotated(tensors.first_divided_differences(values) * components, transposed)

@@ -126,12 +126,6 @@ def congruence(X: Array) -> Array:
 # ---------------------------------------------------------------- eigenvalues and logarithm
 
 
-def eigen(tensors: Array) -> tuple[Array, Array]:
-    """Return ascending eigenvalues (n, 3) and eigenvectors as columns (n, 3, 3)."""
-    values, vectors = np.linalg.eigh(tensors)
-    return values, vectors
-
-
 def stretch_tensor(stretches: Array, axes: Array) -> Array:
     """Return the tensors (..., 3, 3) with stretches (..., 3) along axes, rows (..., 3, 3)."""
     return np.swapaxes(axes, -1, -2) @ (stretches[..., None] * axes)
@@ -144,7 +138,7 @@ def rotated(tensors: Array, vectors: Array) -> Array:
 
 def logarithm(tensors: Array) -> Array:
     """Return ln C, (n, 3, 3)."""
-    values, vectors = eigen(tensors)
+    values, vectors = np.linalg.eigh(tensors)
     return (vectors * np.log(values)[..., None, :]) @ np.swapaxes(vectors, -1, -2)
 
 

@@ -1123,13 +1123,10 @@ class Time(Table):
             yield rule, "step", self.step
         self.check_step_time(self.end, "end")
 
-    def is_step_time(self, time: float) -> bool:
-        """Return whether a step ends at a time, or may end there."""
-        return self.tolerance is not None or math.isclose(time, round(time / self.step) * self.step)
-
     def check_step_time(self, time: float, key: str) -> None:
         """Check that a step may end at a time."""
-        if not self.is_step_time(time):
+        nearest_step = round(time / self.step) * self.step
+        if self.tolerance is None and not math.isclose(time, nearest_step):
             below = math.floor(time / self.step)
             nearest = f"{below * self.step:.12g} and {(below + 1) * self.step:.12g}"
             rule = (
