@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from functools import partial
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import dolfinx.fem
 import numpy as np
@@ -146,9 +146,7 @@ class Loading:
         if number != 1:
             raise ValueError(f"{number} mesh nodes at {point}: a support needs exactly one")
         # With the dofs of the subspace only, the value is a Constant, as for faces.
-        self.boundary_conditions.append(
-            dolfinx.fem.dirichletbc(self.constant(0.0), dofs[0], subspace)
-        )
+        self._prescribe(self.constant(0.0), dofs[0], subspace)
 
     @partial(with_old_arguments, "hold_facets")
     def hold_facets(
@@ -434,7 +432,7 @@ class Loading:
             collapsed, _ = subspace.collapse()
             dofs = dolfinx.fem.locate_dofs_topological((subspace, collapsed), 2, facets)
             value = dolfinx.fem.Function(collapsed)
-            self.boundary_conditions.append(dolfinx.fem.dirichletbc(value, dofs, subspace))
+            self._prescribe(value, dofs, subspace)
             places = collapsed.tabulate_dof_coordinates()[dofs[1]]
             self.follow(name, partial(_set_values, value, dofs[1], places, component, displacement))
 
@@ -553,9 +551,7 @@ class Loading:
 
     def _prescribe_strain(self, component: int, value: Constant) -> None:
         number, _ = self.kinematics.uniform_unknown(self.space, component)
-        self.boundary_conditions.append(
-            dolfinx.fem.dirichletbc(value, number.dofmap.list.flatten(), number)
-        )
+        self._prescribe(value, number.dofmap.list.flatten(), number)
 
     def _prescribe_face(self, face: str, component: int, value: Constant) -> None:
         if self.kinematics.subspace(self.space, component) is not None:
@@ -565,7 +561,10 @@ class Loading:
         subspace = self.kinematics.subspace(self.space, component)
         dimension = self.domain.facet_tags.dim
         dofs = dolfinx.fem.locate_dofs_topological(subspace, dimension, facets)
-        self.boundary_conditions.append(dolfinx.fem.dirichletbc(value, dofs, subspace))
+        self._prescribe(value, dofs, subspace)
+
+    def _prescribe(self, *values_dofs_space: Any) -> None:
+        self.boundary_conditions.append(dolfinx.fem.dirichletbc(*values_dofs_space))
 
 
 def _set_values(

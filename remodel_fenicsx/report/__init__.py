@@ -487,7 +487,6 @@ def curves(run: ReportedRun) -> Card | None:
     history = run.recording.history
     if len(history["time"]) < 2 or not run.columns:
         return None
-    rows = np.unique(np.linspace(0, len(history["time"]) - 1, MOST_ROWS).round().astype(int))
     groups = defaultdict[tuple[str, str], list[str]](list)
     for name in run.columns:
         groups[run.known[name].unit if name in run.known else "", _family(name)].append(name)
@@ -496,9 +495,12 @@ def curves(run: ReportedRun) -> Card | None:
         unit = run.unit(group[0])
         title = words(group[0] if len(group) == 1 else WHOLE.get(family, family))
         title = title[0].upper() + title[1:]
-        series = [{"name": words(name), "values": _finite(history[name][rows])} for name in group]
+        series = [
+            {"name": words(name), "values": _finite(kept_times(history[name], MOST_ROWS))}
+            for name in group
+        ]
         data.append({"title": title, "unit": unit, "series": series})
-    times = history["time"][rows].tolist()
+    times = kept_times(history["time"], MOST_ROWS).tolist()
     return Card("curves", data={"times": times, "curves": data})
 
 
