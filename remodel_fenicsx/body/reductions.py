@@ -9,7 +9,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Any, TYPE_CHECKING
+from typing import Any, Protocol, TYPE_CHECKING
 
 import numpy as np
 
@@ -19,13 +19,23 @@ from remodel_fenicsx.model.cells import cylindrical_axes
 from remodel_fenicsx.model.drivers import DRIVERS
 from remodel_fenicsx.model.laws import LAWS
 from remodel_fenicsx.model.tensors import Array, Integers
-from remodel_fenicsx.schema.settings import LARGEST_MESH
+from remodel_fenicsx.schema.settings import (
+    LARGEST_MESH,
+    Cells,
+    Load,
+    Mesh,
+    Model,
+    Properties,
+    Region,
+    Remodeling,
+    Solver,
+    Supports,
+)
 
 if TYPE_CHECKING:
     from mpi4py import MPI
 
     from remodel_fenicsx.body.domain import Domain
-    from remodel_fenicsx.scene.scene import Scene
 
 
 # ---------------------------------------------------------------- whole bodies for pictures
@@ -119,7 +129,29 @@ class Strut:
     inner_radius: float | None = None
 
 
-Rule = Callable[["Scene"], str | None]
+class ReducedScene(Protocol):
+    """Protocol of the scene that reductions use."""
+
+    geometry: Any
+    mesh: Mesh
+    model: Model
+    cells: Cells
+    supports: Supports
+    regions: dict[str, Region]
+    loads: dict[str, Load]
+    remodeling: Remodeling
+    solver: Solver
+
+    @property
+    def has_random_cells(self) -> bool: ...
+    @property
+    def measured_cells(self) -> dict[str, Cells]: ...
+
+    def each_case(self) -> Sequence[ReducedScene]: ...
+    def properties(self) -> dict[str, Properties]: ...
+
+
+Rule = Callable[[ReducedScene], str | None]
 Turn = Callable[[Array], Array]
 OVERHEAD_IN_POINTS = 60.0  # a step's cost independent of the mesh, in points of hexahedra
 
@@ -155,8 +187,8 @@ class Reduction:
     {'radial': 6, 'axisymmetric': 4, 'sector': 5}
     """
 
-    build: Callable[[Scene, MPI.Intracomm | None], Domain]
-    elements: Callable[[Scene], int]
+    build: Callable[[ReducedScene, MPI.Intracomm | None], Domain]
+    elements: Callable[[ReducedScene], int]
     rules: tuple[Rule, ...]
     turn: Turn
     whole: Callable[[Any, Array, Integers], Body] | None = None
@@ -171,7 +203,7 @@ class Choice:
     objections: dict[str, list[str]]
 
 
-def choice(scene: Scene) -> Choice:
+def choice(scene: ReducedScene) -> Choice:
     """Return the scene's kinematics, or with 'auto' the cheapest one that the scene allows."""
     # Under compressive loads no reduction is selected, because a body that buckles leaves the
     # symmetry.
@@ -189,7 +221,7 @@ def choice(scene: Scene) -> Choice:
     return Choice(next(exact, "full"), reasons_by_name)
 
 
-def objections(scene: Scene, name: str) -> list[str]:
+def objections(scene: ReducedScene, name: str) -> list[str]:
     """Return the reasons why a kinematics would be wrong for a scene; none if it is right."""
     if not KINEMATICS[name].reduced:
         return []
@@ -203,23 +235,23 @@ def objections(scene: Scene, name: str) -> list[str]:
     return reasons
 
 
-def _reasons(rules: Sequence[Rule], scene: Scene) -> list[str]:
+def _reasons(rules: Sequence[Rule], scene: ReducedScene) -> list[str]:
     return [reason for rule in rules if (reason := rule(scene)) is not None]
 
 
-def reasons_for_means(scene: Scene, name: str) -> list[str]:
+def reasons_for_means(scene: ReducedScene, name: str) -> list[str]:
     """Return why an allowed kinematics is right only for means over many seeds; none if exact."""
     reductions = scene.geometry.reductions
     return _reasons(reductions[name].in_the_mean, scene) if name in reductions else []
 
 
-def only_for_means(scene: Scene) -> list[str]:
+def only_for_means(scene: ReducedScene) -> list[str]:
     """Return why the scene's own kinematics is right only for means over seeds; none if exact."""
     name = scene.model.kinematics
     return [f"{name!r}: {reason}" for reason in reasons_for_means(scene, name)]
 
 
-def for_means(scene: Scene) -> str:
+def for_means(scene: ReducedScene) -> str:
     """Return the cheapest kinematics that is right for means over many random seeds, or `auto`."""
     if buckling_risks(scene):
         return AUTO
@@ -231,7 +263,7 @@ def for_means(scene: Scene) -> str:
     return next(suitable, AUTO)
 
 
-def describe_choice(scene: Scene) -> list[str]:
+def describe_choice(scene: ReducedScene) -> list[str]:
     """Describe the choice: why nothing cheaper is allowed, and what the kinematics cannot show."""
     made = choice(scene)
     lines = [f"kinematics {made.name!r}: {KINEMATICS[made.name].meaning}"]
@@ -256,7 +288,7 @@ def describe_choice(scene: Scene) -> list[str]:
     ]
 
 
-def buckling_risks(scene: Scene) -> list[str]:
+def buckling_risks(scene: ReducedScene) -> list[str]:
     """Describe loads that may buckle the body: negative ones, which are compression or suction."""
     if not scene.geometry.reductions or not scene.geometry.buckles:
         return []
@@ -269,14 +301,14 @@ def buckling_risks(scene: Scene) -> list[str]:
     return [f"{' and '.join(pressing)} below zero"] if pressing else []
 
 
-def elements(scene: Scene, name: str) -> int:
+def elements(scene: ReducedScene, name: str) -> int:
     """Return the number of hexahedra, or of elements of fewer dimensions, of a kinematics."""
     if KINEMATICS[name].reduced:
         return scene.geometry.reductions[name].elements(scene)
     return scene.geometry.number_of_elements * scene.mesh.refinement**3
 
 
-def too_many_elements(scene: Scene) -> str:
+def too_many_elements(scene: ReducedScene) -> str:
     """Return the limit of the refinement if the mesh has too many elements, or an empty string."""
     name, refinement = choice(scene).name, scene.mesh.refinement
     if (number := elements(scene, name)) <= LARGEST_MESH:
@@ -293,7 +325,7 @@ def too_many_elements(scene: Scene) -> str:
     )
 
 
-def step_cost(scene: Scene, name: str) -> float:
+def step_cost(scene: ReducedScene, name: str) -> float:
     """Estimate the cost of a step from its quadrature points; 1 is a point of a hexahedron."""
     import basix
     from remodel_fenicsx.fem.quadrature import DEGREES
@@ -306,7 +338,7 @@ def step_cost(scene: Scene, name: str) -> float:
     return OVERHEAD_IN_POINTS + kinematics.cost * number * np.size(weights)
 
 
-def _leaves_symmetry(scene: Scene) -> str:
+def _leaves_symmetry(scene: ReducedScene) -> str:
     """Return the key and value that make the full body leave the symmetric solution, or nothing."""
     remodeling = scene.remodeling
     if remodeling.coupling != "staggered" or scene.geometry.axis_kinds == ("global",):
@@ -331,17 +363,17 @@ def mirrored(places: Array) -> Array:
 
 
 # ---------------------------------------------------------------- rules
-def same_cells(scene: Scene) -> str | None:
+def same_cells(scene: ReducedScene) -> str | None:
     """Require cells that are equal in all elements, neither random nor measured."""
     return unmeasured_cells(scene) or drawn_once(scene)
 
 
-def unmeasured_cells(scene: Scene) -> str | None:
+def unmeasured_cells(scene: ReducedScene) -> str | None:
     """Require cells that do not come from a file."""
     return "cells.fibres has different cells in each element" if scene.measured_cells else None
 
 
-def drawn_once(scene: Scene) -> str | None:
+def drawn_once(scene: ReducedScene) -> str | None:
     """Require random cells to be drawn for one element only."""
     number = scene.geometry.number_of_elements * scene.mesh.refinement**3
     if not scene.has_random_cells or (number == 1 and scene.mesh.element == "hexahedron"):
@@ -349,13 +381,13 @@ def drawn_once(scene: Scene) -> str | None:
     return f"cells.initial = 'random' draws different cells for each of {number} elements"
 
 
-def symmetric_law(scene: Scene) -> str | None:
+def symmetric_law(scene: ReducedScene) -> str | None:
     """Require a law that keeps the symmetry of body and loads."""
     law = scene.remodeling.law
     return None if LAWS[law].keeps_symmetry else f"remodeling.law = {law!r} may break the symmetry"
 
 
-def round_about_z(scene: Scene) -> str | None:
+def round_about_z(scene: ReducedScene) -> str | None:
     """Require cells that are equal in every half-plane through the z axis."""
     axes = scene.cells.axes
     if axes == "cylindrical" or (
@@ -365,7 +397,7 @@ def round_about_z(scene: Scene) -> str | None:
     return f"cells.axes = {axes!r}: cells along x and along the diagonal differ"
 
 
-def symmetric_planes(scene: Scene) -> str | None:
+def symmetric_planes(scene: ReducedScene) -> str | None:
     """Require cells whose mirror images in x = 0 and y = 0 are cells of the body."""
     axes = scene.cells.axes
     return (
@@ -375,7 +407,7 @@ def symmetric_planes(scene: Scene) -> str | None:
     )
 
 
-def homogeneous(scene: Scene) -> str | None:
+def homogeneous(scene: ReducedScene) -> str | None:
     """Require cells that are equal everywhere, and stay equal."""
     axes, lengths = scene.cells.axes, _dimensions(scene)
     if len(lengths) > 1:
@@ -390,7 +422,7 @@ def homogeneous(scene: Scene) -> str | None:
     return None if stays else "cells.axes = 'cylindrical': cells and stress are not homogeneous"
 
 
-def free_ends(scene: Scene) -> str | None:
+def free_ends(scene: ReducedScene) -> str | None:
     """Require ends that move radially as all other sections."""
     ends = scene.supports.ends
     return None if ends in ("free", "closed") else f"supports.ends = {ends!r}: sections differ"
@@ -399,7 +431,7 @@ def free_ends(scene: Scene) -> str | None:
 def known_loads(name: str) -> Rule:
     """Return the rule that a scene has only loads that a kinematics can apply."""
 
-    def rule(scene: Scene) -> str | None:
+    def rule(scene: ReducedScene) -> str | None:
         kinds = scene.geometry.loads
         unknown = [f"loads.{load}" for load in scene.loads if name not in kinds[load].reductions]
         return (
@@ -409,7 +441,7 @@ def known_loads(name: str) -> Rule:
     return rule
 
 
-def _dimensions(scene: Scene) -> list[tuple[float, ...]]:
+def _dimensions(scene: ReducedScene) -> list[tuple[float, ...]]:
     """Return the initial l1, l2, l3 of the first cell of each region."""
     return [
         tuple(map(float, properties.cells.dimensions(1)[0]))

@@ -43,7 +43,6 @@ if TYPE_CHECKING:
     from remodel_fenicsx.body.loading import Loading
     from remodel_fenicsx.fem.quadrature import Quadrature
     from remodel_fenicsx.results.columns import Measurement
-    from remodel_fenicsx.scene.scene import Scene
 
 log = logging.getLogger(__name__)
 
@@ -1070,7 +1069,7 @@ def homogeneous_bar(
 ) -> reduced.Reduction:
     """Return the reduction "point", of uniform strain, for a body between two faces across z."""
 
-    def build(scene: Scene, comm: MPI.Intracomm | None) -> Domain:
+    def build(scene: reduced.ReducedScene, comm: MPI.Intracomm | None) -> Domain:
         from remodel_fenicsx.body.domain import lattice_domain
 
         shape, length = scene.geometry, scene.geometry.axial_length

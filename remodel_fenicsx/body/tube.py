@@ -26,6 +26,7 @@ from remodel_fenicsx.body.shape import (
     Supports,
     check_lengths,
 )
+from remodel_fenicsx.body.reductions import ReducedScene
 from remodel_fenicsx.body.wall import (
     FACES,
     AngleOf,
@@ -49,7 +50,6 @@ if TYPE_CHECKING:
 
     from remodel_fenicsx.body.domain import Domain
     from remodel_fenicsx.body.loading import Loading
-    from remodel_fenicsx.scene.scene import Scene
 
 log = logging.getLogger(__name__)
 
@@ -58,7 +58,7 @@ PAPER = (16, 8, 12)  # the paper's elements around, through the wall, and along
 # ---------------------------------------------------------------- meshes of reductions
 
 
-def build_in_half_plane(dimension: int, scene: Scene, comm: MPI.Intracomm | None) -> Domain:
+def build_in_half_plane(dimension: int, scene: ReducedScene, comm: MPI.Intracomm | None) -> Domain:
     """Mesh the wall with the body's elements on the x axis (1) or in the half-plane y = 0 (2)."""
     from remodel_fenicsx.body.domain import lattice_domain
 
@@ -83,7 +83,7 @@ def build_in_half_plane(dimension: int, scene: Scene, comm: MPI.Intracomm | None
     )
 
 
-def build_quarter(scene: Scene, comm: MPI.Intracomm | None) -> Domain:
+def build_quarter(scene: ReducedScene, comm: MPI.Intracomm | None) -> Domain:
     """Mesh the quarter x > 0, y > 0, with one layer along z if all sections are equal."""
     mesh, (around, through, _) = scene.mesh, _counts(scene.mesh)
     counts = around, through, layers(scene)
@@ -92,7 +92,7 @@ def build_quarter(scene: Scene, comm: MPI.Intracomm | None) -> Domain:
     )
 
 
-def layers(scene: Scene) -> int:
+def layers(scene: ReducedScene) -> int:
     """Return the number of a quarter's elements along z: one if only u_z depends on z, linearly."""
     alike = reduced.free_ends(scene) is None and reduced.same_cells(scene) is None
     return 1 if alike else PAPER[2] * scene.mesh.refinement
@@ -135,7 +135,7 @@ def _in_layers(points: Array, elements: Integers) -> reduced.Body:
     )
 
 
-def springs_across(scene: Scene) -> str | None:
+def springs_across(scene: ReducedScene) -> str | None:
     """Require springs without tangential stiffness, so that sections stay plane."""
     for face, support in scene.supports.faces.items():
         if support.tangential:
@@ -143,7 +143,7 @@ def springs_across(scene: Scene) -> str | None:
     return None
 
 
-def mirrored_draws(scene: Scene) -> str | None:
+def mirrored_draws(scene: ReducedScene) -> str | None:
     """Require no random cells: those of a quarter represent the tube only in means."""
     if reduced.drawn_once(scene) is None:
         return None

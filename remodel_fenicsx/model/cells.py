@@ -83,8 +83,7 @@ def turned_about_z(axes: Array, angle: float) -> Array:
 def cylindrical_axes(coordinates: Array) -> Array:
     """Return circumferential, axial and radial direction about z as rows, (..., 3, 3)."""
     axes = np.zeros((*coordinates.shape[:-1], 3, 3))
-    radius = np.sqrt(coordinates[..., 0] ** 2 + coordinates[..., 1] ** 2)
-    radial = coordinates[..., :2] / radius[..., None]
+    radial = coordinates[..., :2] / np.linalg.norm(coordinates[..., :2], axis=-1, keepdims=True)
     axes[..., 0, 0], axes[..., 0, 1] = -radial[..., 1], radial[..., 0]
     axes[..., 1, 2] = 1.0
     axes[..., 2, :2] = radial

@@ -598,7 +598,8 @@ class TurnoverRule(NamedTuple):
 
 def _secant(tissue: Tissue) -> Tension:
     """Return g(lambda r0), the secant stiffness of chains, as a function of lambda."""
-    chain, r0, contour = tissue.chain, tissue.end_to_end_length, tissue.contour_length
+    chain, r0 = tissue.chain, tissue.end_to_end_length
+    contour = tissue.contour_length
     assert chain is not None
     return lambda stretch: chain.stiffness(stretch * r0, contour)
 
