@@ -18,7 +18,7 @@ from remodel_fenicsx.body.wall import RoundWall
 from remodel_fenicsx.errors import UnreadableFile
 from remodel_fenicsx.fem.assembly import raise_on_all_ranks
 from remodel_fenicsx.fem.formulations import FORMULATIONS
-from remodel_fenicsx.fem.kinematics import KINEMATICS, WITH_NUMBERS, NaturalConfiguration
+from remodel_fenicsx.fem.kinematics import WITH_NUMBERS, NaturalConfiguration
 from remodel_fenicsx.fem.quadrature import Quadrature
 from remodel_fenicsx.model.axes import GROWTH, NATURAL_GRADIENT, LocalAxes
 from remodel_fenicsx.model.tensors import Array, Flags, stretch_tensor
@@ -99,7 +99,7 @@ def initial_states(scene: Scene, domain: Domain, fibres: Fibres) -> list[State]:
 
 def make_kinematics(scene: Scene, domain: Domain) -> Any:
     """Return the scene's kinematics on a stress-free mesh."""
-    kinematics = KINEMATICS[scene.model.kinematics].for_mesh(domain.mesh, scene.geometry)
+    kinematics = scene.kinematics.for_mesh(domain.mesh, scene.geometry)
     wrapper = WITH_NUMBERS.get((scene.has_free_length, scene.has_unknown_pressure))
     if wrapper is None:
         return kinematics
@@ -216,7 +216,7 @@ def resolve_auto_settings(scene: Scene, domain: Domain | None = None) -> Scene:
 
 def mesh_of(scene: Scene, comm: MPI.Intracomm) -> Domain:
     """Return the mesh of a scene: of its body, or of a reduction's part of the body. Collective."""
-    if KINEMATICS[scene.model.kinematics].reduced:
+    if scene.kinematics.reduced:
         return scene.geometry.reductions[scene.model.kinematics].build(scene, comm)
     return scene.geometry.build_with(scene.regions, scene.mesh, comm)
 
@@ -227,7 +227,7 @@ def checked_domain(domain: Domain, scene: Scene) -> Domain:
     kind, degree = mesh.topology.cell_name(), mesh.geometry.cmap.degree
     if domain.shape != shape.name:
         raise SceneError(f"geometry.shape = {shape.name!r}: the mesh is a {domain.shape!r}")
-    element = KINEMATICS[scene.model.kinematics].element(scene.mesh.element)
+    element = scene.kinematics.element(scene.mesh.element)
     if kind != element:
         raise SceneError(
             f"mesh.element = {scene.mesh.element!r}: the mesh has elements of type {kind!r}"
@@ -245,7 +245,7 @@ def checked_domain(domain: Domain, scene: Scene) -> Domain:
         and (others := set(domain.regions) - set(scene.regions))
     ):
         raise SceneError(f"regions.{min(others)}: missing; it is a region of the mesh")
-    needed = () if KINEMATICS[scene.model.kinematics].reduced else shape.face_names
+    needed = () if scene.kinematics.reduced else shape.face_names
     missing = [face for face in needed if face not in domain.faces]
     if missing:
         raise SceneError(

@@ -18,7 +18,6 @@ from mpi4py import MPI
 from petsc4py import PETSc
 
 from remodel_fenicsx.evolution.stepper import Pause, Step, Watcher
-from remodel_fenicsx.fem.kinematics import KINEMATICS
 from remodel_fenicsx.fem.quadrature import Quadrature
 from remodel_fenicsx.fem.assembly import raise_on_all_ranks
 from remodel_fenicsx.results.checkpoint import Checkpoints, restore_state
@@ -450,7 +449,7 @@ def write_axes(scene: Scene, path: Path) -> str:
     scene = resolve_auto_settings(scene)
     domain, shape = checked_domain(mesh_of(scene, MPI.COMM_WORLD), scene), scene.geometry
     mesh = domain.mesh
-    weight = KINEMATICS[scene.model.kinematics].for_mesh(mesh, shape).weight(mesh)
+    weight = scene.kinematics.for_mesh(mesh, shape).weight(mesh)
     quadrature = Quadrature(mesh, scene.mesh.degree, weight)
     local_axes = shape.local_axes(domain, quadrature)
     fields = local_fields(local_axes, quadrature) | {

@@ -30,7 +30,6 @@ from numpy.typing import ArrayLike, NDArray
 from remodel_fenicsx._version import __version__
 from remodel_fenicsx.body.shape import Column, columns_of_region
 from remodel_fenicsx.body.wall import Walled
-from remodel_fenicsx.fem.kinematics import KINEMATICS
 from remodel_fenicsx.errors import RemodelError
 from remodel_fenicsx.model.axes import GROWTH, push_forward_axes
 from remodel_fenicsx.results.recording import (
@@ -538,7 +537,7 @@ def facts(run: ReportedRun) -> Card:
     tables["geometry"] += [text for text in texts if text.startswith(UNLOADED_PREFIX)][-1:]
     if run.body:
         tables["mesh"].append(f"{len(run.recording.elements):,} elements")
-    tables["model"].append(KINEMATICS[scene.model.kinematics].meaning)
+    tables["model"].append(scene.kinematics.meaning)
     tables["material"].append(scene.summary())
     steps = f"{max(0, len(history['time']) - 1)}{'' if scene.time.is_adaptive else ' of'} "
     steps += scene.time.in_words()

@@ -15,7 +15,6 @@ from tempfile import TemporaryDirectory
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from remodel_fenicsx.fem.kinematics import KINEMATICS
 from remodel_fenicsx.model.axes import GROWTH, NATURAL_GRADIENT
 from remodel_fenicsx.model.cells import structure_tensor
 from remodel_fenicsx.model.energy import TURNED_OVER
@@ -132,11 +131,12 @@ def unevenness(elements: Integers, tensors: Array) -> float:
 
 def recorded_fibres(recording: RecordedRun, time: float | None = None) -> Fibres:
     """Read the cells of a run at a recorded time; None is the last one."""
-    kinematics = recording.scene.model.kinematics
-    if KINEMATICS[kinematics].reduced:
+    kinematics = recording.scene.kinematics
+    if kinematics.reduced:
         remedy = "revolve writes the fields of the whole body, as does model.kinematics = 'full'"
         raise RecordingError(
-            f"{recording.path}: its kinematics {kinematics!r} model a part of the body; {remedy}"
+            f"{recording.path}: its kinematics {kinematics.name!r} model a part of the body; "
+            f"{remedy}"
         )
     if not len(recording.times):
         raise RecordingError(f"{recording.path}: the run recorded no fields")

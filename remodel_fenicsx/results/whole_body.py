@@ -10,7 +10,6 @@ import numpy as np
 
 from remodel_fenicsx._lazy import Late
 from remodel_fenicsx.body.reductions import Turn
-from remodel_fenicsx.fem.kinematics import KINEMATICS
 from remodel_fenicsx.model.axes import NATURAL_GRADIENT
 from remodel_fenicsx.model.tensors import Array, Integers
 from remodel_fenicsx.results.recording import RecordedRun, RecordingError
@@ -138,7 +137,7 @@ class WholeBody:
                 f"{recording.path}: the run recorded no fields of a body (output.fields)"
             )
         scene = recording.scene
-        shape, kinematics = scene.geometry, KINEMATICS[scene.model.kinematics]
+        shape, kinematics = scene.geometry, scene.kinematics
         self.recording, self.is_turned = recording, kinematics.reduced
         points = recording.points
         elements = recording.elements[:, : CORNERS[kinematics.element(scene.mesh.element)]]
@@ -226,10 +225,10 @@ BODY, BODY_CHAINS = "fields_body.vtkhdf", "fields_body_chains.vtkhdf"
 def revolve(folder: Path | str) -> list[Path]:
     """Write the recorded fields of a reduced run on the mesh of the whole body."""
     recording = RecordedRun(folder)
-    name = recording.scene.model.kinematics
-    if not KINEMATICS[name].reduced:
+    kinematics = recording.scene.kinematics
+    if not kinematics.reduced:
         raise RecordingError(
-            f"{recording.path}: its kinematics are {name!r}: "
+            f"{recording.path}: its kinematics are {kinematics.name!r}: "
             "the fields are those of the body already"
         )
     paths = [recording.path / file for file in (BODY, BODY_CHAINS)]

@@ -15,7 +15,6 @@ from remodel_fenicsx.body.reductions import AUTO, choice, objections, too_many_e
 from remodel_fenicsx.body.shape import FromFile, Unloads, WithAxes, WithRegions
 from remodel_fenicsx.body.wall import RoundWall, Walled
 from remodel_fenicsx.fem.formulations import FORMULATIONS
-from remodel_fenicsx.fem.kinematics import KINEMATICS
 from remodel_fenicsx.fem.solver_methods import SOLVER_METHODS
 from remodel_fenicsx.model.chains import CHAINS
 from remodel_fenicsx.model.laws import LAWS, MEANS_OF_CASES
@@ -121,11 +120,12 @@ def loaded_body(scene: Scene) -> Faults:
 
 def same_strain(scene: Scene) -> Faults:
     """Check that loads and cells that need a uniform strain have homogeneous kinematics."""
-    made, angle = choice(scene), scene.cells.mean_angle
-    if angle and not (isinstance(scene.geometry, Sheet) and KINEMATICS[made.name].homogeneous):
+    angle = scene.cells.mean_angle
+    if angle and not (isinstance(scene.geometry, Sheet) and scene.kinematics.homogeneous):
         yield "needs a sheet with model.kinematics = 'point'", "cells.mean_angle", angle
     for name, load in scene.loads.items():
-        if scene.load_kinds[name].of_one_strain and not KINEMATICS[made.name].homogeneous:
+        if scene.load_kinds[name].of_one_strain and not scene.kinematics.homogeneous:
+            made = choice(scene)
             reasons = "; ".join(made.objections["point"]) or f"model.kinematics = {made.name!r}"
             rule = f"needs a uniform strain (model.kinematics = 'point'), but {reasons}"
             yield rule, f"loads.{name}.value", load.value
@@ -133,10 +133,7 @@ def same_strain(scene: Scene) -> Faults:
 
 def directions_of_matrices(scene: Scene) -> Faults:
     """Check that the directions of a matrix follow a round wall."""
-    if (
-        not isinstance(scene.geometry, RoundWall)
-        or not KINEMATICS[choice(scene).name].three_dimensional
-    ):
+    if not isinstance(scene.geometry, RoundWall) or not scene.kinematics.three_dimensional:
         return
     for name, properties in scene.properties().items():
         if not properties.tissue.is_round():

@@ -24,7 +24,7 @@ from remodel_fenicsx.body.reductions import AUTO, choice
 from remodel_fenicsx.body.shape import Column, columns_of, columns_on_request
 from remodel_fenicsx.body.wall import RoundWall, Walled
 from remodel_fenicsx.fem.formulations import FORMULATIONS, NOT_LOCKING
-from remodel_fenicsx.fem.kinematics import KINEMATICS
+from remodel_fenicsx.fem.kinematics import KINEMATICS, Kinematics
 from remodel_fenicsx.model.axes import GROWTH, NATURAL_GRADIENT
 from remodel_fenicsx.model.chains import CHAINS
 from remodel_fenicsx.model.energy import MATRICES, REPULSIONS, TURNED_OVER, Tissue, neo_hookean
@@ -387,6 +387,11 @@ class Scene(Table):
         return max(material.lame_lambda / material.lame_mu for material in materials)
 
     @property
+    def kinematics(self) -> Kinematics:
+        """The kinematics that are set, or the ones that "auto" resolves to."""
+        return KINEMATICS[choice(self).name]
+
+    @property
     def formulation(self) -> str:
         """The formulation that is set, or the one that "auto" resolves to."""
         if self.mesh.formulation != AUTO:
@@ -417,7 +422,7 @@ class Scene(Table):
             return f"{key} above 0"
         if not self.material.has_volumetric_split:
             return f"material.matrix = {self.material.matrix!r}"
-        return "homogeneous deformation" if KINEMATICS[choice(self).name].homogeneous else ""
+        return "homogeneous deformation" if self.kinematics.homogeneous else ""
 
     def describe_formulation(self) -> str:
         """Describe the resolved formulation and its reason."""

@@ -226,20 +226,16 @@ class Continuation:
                 part *= 2
                 work.substeps += 1
 
-    def check_for_jump(self, before: Array, work: Work, again: bool) -> bool:
-        """Repeat a step in substeps if it may have jumped. Return True if so. Collective."""
+    def check_for_jump(self, before: Array, work: Work, again: bool) -> None:
+        """Repeat a step in substeps if it may have jumped. Collective."""
         # `again`: the same step was solved before, with other cells.
         vector, last = self.state.unknown.x, self.state.numbers.get(LAST_CHANGE, 0.0)
         moved = self._size(vector.array - before)
         tangents, expected = work.tangents if work.substeps == 1 else 0, 0.0 if again else last
-        looked = (
-            self.is_another_branch(work.last, moved, expected, tangents) and self._may_check_jumps()
-        )
-        if looked:
+        if self.is_another_branch(work.last, moved, expected, tangents) and self._may_check_jumps():
             self.repeat_in_substeps(before, work)
             moved = self._size(vector.array - before)
         self.state.numbers[LAST_CHANGE] = max(moved, last) if again else moved
-        return looked
 
     def repeat_in_substeps(self, before: Array, work: Work) -> None:
         """Repeat a step in substeps from the unknowns before it. Collective."""

@@ -219,7 +219,7 @@ def _row(result: Result, finest: Result) -> Row:
     error = nanrms(np.mean(apart, axis=0))
     ratio = np.mean(result.lengths, axis=0) / np.mean(finest.lengths, axis=0)
     sizes = {"steps": (setting.step, finest.setting.step)}
-    if not KINEMATICS[setting.scene.model.kinematics].homogeneous:
+    if not setting.scene.kinematics.homogeneous:
         sizes["elements"] = setting.element, finest.setting.element
     shared = [name for name, (own, least) in sizes.items() if own < FINER * least]
     doubt = f"the finest has no finer {' and '.join(shared)}" if shared else ""
