@@ -38,7 +38,7 @@ from remodel_fenicsx.results.recording import (
     unit_of,
     words,
 )
-from remodel_fenicsx.results.whole_body import AXIS_FIELDS, WholeBody, chain_lines
+from remodel_fenicsx.results.whole_body import AXIS_FIELDS, WholeBody, axes_of, chain_lines
 from remodel_fenicsx.schema.settings import STRESS_FIELDS
 from remodel_fenicsx.system.children import environment_of_child, last_line
 from remodel_fenicsx.system.files import TakenError, numbered, write_new
@@ -126,7 +126,7 @@ def chains(body: pyvista.UnstructuredGrid) -> pyvista.PolyData:
     sides = (reference + np.roll(reference, 1, axis=1)) / 2 - reference.mean(1, keepdims=True)
     # Twice the undeformed distance from the middle of a face to its closest side.
     size = 2 * np.linalg.norm(sides, axis=2).min(1)
-    axes = np.stack([surface.cell_data[name] for name in AXIS_FIELDS], 1)
+    axes = axes_of(surface.cell_data)
     lengths = surface.cell_data["cell_dimensions"]
     ends, lines = chain_lines(np.zeros_like(middle), lengths, axes, CHAIN_LOOK["reach"])
     gradient = surface.cell_data["deformation_gradient"].reshape(-1, 3, 3)

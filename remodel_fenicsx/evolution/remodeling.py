@@ -20,6 +20,7 @@ from remodel_fenicsx.model.cells import UnitCell, angle_between, structure_tenso
 from remodel_fenicsx.model.drivers import DRIVERS, FRAMES, convected_axes
 from remodel_fenicsx.model.energy import Tissue
 from remodel_fenicsx.model.laws import (
+    cells_from_structure,
     Drive,
     LAWS,
     MEANS_OF_CASES,
@@ -338,10 +339,9 @@ class RemodelingPass(Remodels):
 
     def with_change(self, values: UnitCell, change: Array) -> UnitCell:
         """Return cells after a change of A, in Mandel components."""
-        squared, axes = spectral.principal_by_continuity(
+        return cells_from_structure(
             structure_tensor(*values[:2]) + tensors.from_mandel(change), values.axes
         )
-        return UnitCell(np.sqrt(np.maximum(squared, 0.0)), axes)
 
     def after_pass(self, values: UnitCell, time: float, residual: float) -> UnitCell:
         """Return cells after a pass up to a time."""

@@ -129,9 +129,14 @@ def relaxed(old: UnitCell, new: UnitCell, factor: Array | float) -> UnitCell:
     if np.ndim(factor) == 0 and factor == 1.0:
         return new
     before, after = structure_tensor(*old[:2]), structure_tensor(*new[:2])
-    squared, axes = spectral.principal_by_continuity(
+    return cells_from_structure(
         before + np.reshape(factor, (-1, 1, 1)) * (after - before), new.axes
     )
+
+
+def cells_from_structure(structure: Array, previous: Array) -> UnitCell:
+    """Return the cells of structure tensors, in the order of the previous axes."""
+    squared, axes = spectral.principal_by_continuity(structure, previous)
     return UnitCell(np.sqrt(np.maximum(squared, 0.0)), axes)
 
 

@@ -49,6 +49,7 @@ from remodel_fenicsx.results.recording import (
 from remodel_fenicsx.results.status import OVERRIDE, log_entries, state_of
 from remodel_fenicsx.results.whole_body import (
     AXIS_FIELDS,
+    axes_of,
     DIRECTION_FIELDS,
     SECTORS,
     TENSOR_FIELDS,
@@ -223,7 +224,7 @@ def _of_elements(fields: dict[str, Places]) -> dict[str, Places]:
     names |= {name: name for name in STRESS_FIELDS}
     series = {name: fields[field] for name, field in names.items() if field in fields}
     if set(CELL) <= set(fields):
-        axes = np.stack([fields[name] for name in AXIS_FIELDS], axis=1)
+        axes = axes_of(fields)
         if "deformation_gradient" in fields:
             axes = axes @ np.swapaxes(fields["deformation_gradient"].reshape(-1, 3, 3), 1, 2)
         series["edges"] = fields["cell_dimensions"][:, :, None] * axes

@@ -20,7 +20,7 @@ from remodel_fenicsx.model.cells import structure_tensor
 from remodel_fenicsx.model.energy import TURNED_OVER
 from remodel_fenicsx.model.tensors import Array, Integers
 from remodel_fenicsx.results.recording import RecordedRun, RecordingError, unit_of
-from remodel_fenicsx.results.whole_body import AXIS_FIELDS, WholeBody
+from remodel_fenicsx.results.whole_body import AXIS_FIELDS, WholeBody, axes_of
 from remodel_fenicsx.schema.settings import OnFace, Support, faces_of
 from remodel_fenicsx.system.files import write_new
 
@@ -147,7 +147,7 @@ def recorded_fibres(recording: RecordedRun, time: float | None = None) -> Fibres
     missing = [name for name in needed if name not in fields]
     if missing:
         raise RecordingError(f"{recording.path}: output.fields was without {', '.join(missing)}")
-    axes = np.stack([fields[name] for name in AXIS_FIELDS], axis=1)
+    axes = axes_of(fields)
     if NATURAL_GRADIENT not in {*fields, *recording.scene.lacking_fields}:
         log.warning(
             "%s: output.fields was without %s: the prestretch is not written",

@@ -83,6 +83,11 @@ AXIS_FIELDS = ("axis_1", "axis_2", "axis_3")
 OF_CHAINS = ("cell_dimensions", *AXIS_FIELDS, "deformation_gradient", "fibre_angle")
 
 
+def axes_of(fields: Mapping[str, Array]) -> Array:
+    """Return the axes of cells from their fields, as rows (m, 3, 3)."""
+    return np.stack([fields[name] for name in AXIS_FIELDS], axis=1)
+
+
 def chain_lines(
     centres: Array, lengths: Array, axes: Array, scale: float
 ) -> tuple[Array, Integers]:
@@ -112,7 +117,7 @@ def append_chains(
     fields: Mapping[str, Array],
 ) -> TransientGrid:
     """Append a step to a file of chain lines; for the first step, `grid` is the file's path."""
-    axes = np.stack([fields[name] for name in AXIS_FIELDS], axis=1)
+    axes = axes_of(fields)
     centres, middle = (values[elements].mean(axis=1) for values in (points, displacement))
     ends, lines = chain_lines(centres, fields["cell_dimensions"], axes, scale)
     moved = chain_displacement(

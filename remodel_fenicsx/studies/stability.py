@@ -13,9 +13,8 @@ from mpi4py import MPI
 
 from remodel_fenicsx.evolution.stepper import Step, Stepper, Watcher
 from remodel_fenicsx.fem.kinematics import KINEMATICS
-from remodel_fenicsx.model import spectral
 from remodel_fenicsx.model.cells import structure_tensor
-from remodel_fenicsx.model.laws import LAWS, relaxed
+from remodel_fenicsx.model.laws import LAWS, cells_from_structure, relaxed
 from remodel_fenicsx.model.tensors import Array
 from remodel_fenicsx.results.run_folder import chosen_folder
 from remodel_fenicsx.running import run
@@ -64,8 +63,7 @@ def pass_factor(stepper: Stepper, step: Step) -> float:
             if not (largest := quadrature.maximum(relative.reshape(quadrature.shape))):
                 return 0.0
             change *= SIZE / largest
-            squared, axes = spectral.principal_by_continuity(tensor + change, cells.axes)
-            state.cells.set(np.sqrt(np.maximum(squared, 0.0)), axes)
+            state.cells.set(*cells_from_structure(tensor + change, cells.axes)[:2])
             newton.solve()
             before, change = change, passed() - undisturbed
             factors.append(
