@@ -15,12 +15,13 @@ from tempfile import TemporaryDirectory
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from remodel_fenicsx.fem.kinematics import KINEMATICS
 from remodel_fenicsx.model.axes import GROWTH, NATURAL_GRADIENT
 from remodel_fenicsx.model.cells import structure_tensor
 from remodel_fenicsx.model.energy import TURNED_OVER
 from remodel_fenicsx.model.tensors import Array, Integers
 from remodel_fenicsx.results.recording import RecordedRun, RecordingError, unit_of
-from remodel_fenicsx.results.whole_body import AXIS_FIELDS, WholeBody, axes_of
+from remodel_fenicsx.results.whole_body import AXIS_FIELDS, WholeBody
 from remodel_fenicsx.schema.settings import OnFace, Support, faces_of
 from remodel_fenicsx.system.files import write_new
 
@@ -131,12 +132,11 @@ def unevenness(elements: Integers, tensors: Array) -> float:
 
 def recorded_fibres(recording: RecordedRun, time: float | None = None) -> Fibres:
     """Read the cells of a run at a recorded time; None is the last one."""
-    kinematics = recording.scene.kinematics
-    if kinematics.reduced:
+    kinematics = recording.scene.model.kinematics
+    if KINEMATICS[kinematics].reduced:
         remedy = "revolve writes the fields of the whole body, as does model.kinematics = 'full'"
         raise RecordingError(
-            f"{recording.path}: its kinematics {kinematics.name!r} model a part of the body; "
-            f"{remedy}"
+            f"{recording.path}: its kinematics {kinematics!r} model a part of the body; {remedy}"
         )
     if not len(recording.times):
         raise RecordingError(f"{recording.path}: the run recorded no fields")
@@ -147,7 +147,7 @@ def recorded_fibres(recording: RecordedRun, time: float | None = None) -> Fibres
     missing = [name for name in needed if name not in fields]
     if missing:
         raise RecordingError(f"{recording.path}: output.fields was without {', '.join(missing)}")
-    axes = axes_of(fields)
+    axes = np.stack([fields[name] for name in AXIS_FIELDS], axis=1)
     if NATURAL_GRADIENT not in {*fields, *recording.scene.lacking_fields}:
         log.warning(
             "%s: output.fields was without %s: the prestretch is not written",
