@@ -135,7 +135,7 @@ def relaxed(old: UnitCell, new: UnitCell, factor: Array | float) -> UnitCell:
 
 
 def cells_from_structure(structure: Array, previous: Array) -> UnitCell:
-    """Return the cells of structure tensors, in the order of the previous axes."""
+    """Compute cells from structure tensors, in the order of the previous axes."""
     squared, axes = spectral.principal_by_continuity(structure, previous)
     return UnitCell(np.sqrt(np.maximum(squared, 0.0)), axes)
 
