@@ -11,6 +11,7 @@ from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from tempfile import TemporaryDirectory
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -25,9 +26,12 @@ from remodel_fenicsx.results.whole_body import AXIS_FIELDS, WholeBody
 from remodel_fenicsx.schema.settings import OnFace, Support, faces_of
 from remodel_fenicsx.system.files import write_new
 
+if TYPE_CHECKING:
+    from remodel_fenicsx.scene import Scene
 
 log = logging.getLogger(__name__)
 SECTORS_HEAD = "sector,hoop_stress_inner,hoop_stress_middle,hoop_stress_outer"
+IN_PLANE = 1e-6  # over the size of a body; meshes in single precision are exact to 1e-7
 LEAST_SAID = 0.01  # change between elements: a fit of angles does not resolve less
 
 
@@ -188,15 +192,65 @@ def _csv(path: Path, fibres: Fibres, recording: RecordedRun, time: float) -> Non
         _write(path.with_name("sectors.csv"), f"{SECTORS_HEAD}\n{rows}\n".replace("nan", ""))
 
 
-def _model(program: str, path: Path, fibres: Fibres, recording: RecordedRun, time: float) -> None:
-    """Write the body with its regions, faces, supports and pressures for one of PROGRAMS."""
+def elastic_constants(lame_lambda: float, lame_mu: float) -> dict[str, float]:
+    """Return E and v of FEBio's neo-Hookean, and C10 = mu / 2 and D1 = 2 / K of Abaqus's."""
+    v = lame_lambda / (lame_lambda + lame_mu) / 2
+    bulk = lame_lambda + 2 * lame_mu / 3
+    return {"E": 2 * lame_mu * (1 + v), "v": v, "C10": lame_mu / 2, "D1": 2 / bulk}
+
+
+def _add_conditions(
+    add: Callable[..., None], scene: Scene, domain: Any, nodes: Integers, time: float
+) -> None:
+    """Add fixed nodes and pressures; warn of supports and loads that these do not express."""
     from dolfinx.mesh import entities_to_geometry
+
+    from remodel_fenicsx.body.domain import dof_of_node
+    from remodel_fenicsx.body.loading import Loading, values_of_loads
+
+    shape, supports, loads = scene.geometry, scene.supports, scene.each_case()[0].loads
+    loading = Loading(domain, KINEMATICS["full"].unknown(domain.mesh, scene.mesh.degree))
+    shape.support(loading, supports.ends, loads)
+    shape.hold_faces(loading, supports.faces, 1.0, loads)
+    free = loading.unknown.x.array + 1  # 1, and 0 at fixed degrees of freedom: all loads are zero
+    for condition in loading.boundary_conditions:
+        condition.set(free)
+    free = free.reshape(-1, 3)[dof_of_node(domain.mesh, loading.space)]
+    changed = [f"supports.ends = {supports.ends!r} (left out)"] * loading.has_caps
+    for face in filter(loading.supports.get, loading.supports):  # on springs
+        support, how = supports.faces.get(face, Support()), "left out"
+        for part, facets in domain.facets_of_parts(face) if support.stiffness is None else ():
+            along = part.normal.round(6) ** 2 == 1
+            on_face = entities_to_geometry(domain.mesh, 2, facets)
+            arms = domain.mesh.geometry.x[on_face] - part.centre
+            # At nodes level with the centre the circumferential direction is that of an axis.
+            centred = (np.abs(arms) < IN_PLANE * domain.size) & (support.kind == "guided")
+            if along.any():
+                how = "simplified"
+                free[on_face] *= ~(along | centred)
+        changed.append(f"supports.{face} ({how})")
+    for axis, column in zip("xyz", domain.gather_nodes(free)[nodes].T, strict=True):
+        if not column.all():
+            fixed = ",".join(map(str, nodes[column == 0] + 1))
+            add("node_set", f"fixed_{axis}", nodes=fixed)
+            add("fixed", f"fixed_{axis}", axis=axis, number="xyz".find(axis) + 1)
+    on_faces = {"pressure": OnFace("inner")} | faces_of(loads)
+    for name, value in values_of_loads(loads, time).items():
+        if name in on_faces and on_faces[name].kind == "pressure":
+            add("pressure", on_faces[name].face, value=value)
+        else:
+            changed.append(f"loads.{name} (left out)")
+    if changed:
+        log.warning("supports and loads that the file changes: %s", ", ".join(changed))
+
+
+def _model(program: str, path: Path, fibres: Fibres, recording: RecordedRun, time: float) -> None:
+    """Write the body with its regions, faces, matrix, supports and pressures for a program."""
     from mpi4py import MPI
 
     from remodel_fenicsx.body.domain import cells_of
-    from remodel_fenicsx.body.loading import values_of_loads
 
-    scene, supports = recording.scene, recording.scene.supports.faces
+    scene, properties = recording.scene, recording.scene.properties()
     domain = scene.geometry.build_with(scene.regions, scene.mesh, MPI.COMM_SELF)
     if domain.number_of_elements != len(fibres.elements):
         raise RecordingError(f"{recording.path}: the scene's mesh has other elements than the run")
@@ -204,6 +258,7 @@ def _model(program: str, path: Path, fibres: Fibres, recording: RecordedRun, tim
     texts, elements = PROGRAMS[program], fibres.reduced
     nodes, count = np.unique(elements), str(elements.shape[1])
     kind, sides = PROGRAMS["elements"][count][program], np.array(PROGRAMS["sides"][count])
+    pattern = texts["facets"][str(sides.shape[1] - 1)]
     axes = np.moveaxis(fibres.axes, 1, 0)
     parts = defaultdict[str, list[str]](list)
 
@@ -212,6 +267,10 @@ def _model(program: str, path: Path, fibres: Fibres, recording: RecordedRun, tim
         parts[part].append(texts[part].format(name=label, **values))
 
     for name, number in domain.regions.items():
+        material = (properties.get(name) or properties[""]).material
+        constants = elastic_constants(material.lame_lambda, material.lame_mu)
+        add("material", name, index=len(parts["material"]) + 1, **constants)
+        add("section", name)
         rows = np.flatnonzero(region == number)
         add("part", name, kind=kind, rows=_rows(texts["element"], rows + 1, elements[rows] + 1))
         add("local_axes", name, rows=_rows(texts["axes"], rows + 1, *axes[:2, rows]))
@@ -219,27 +278,19 @@ def _model(program: str, path: Path, fibres: Fibres, recording: RecordedRun, tim
             text = _rows(texts["value"], rows + 1, values[rows])
             add("values", name, key=key, kind="mat3" if values.ndim > 1 else "scalar", rows=text)
     for name in domain.faces:
-        local = domain.facets(name)
-        on_face = domain.node_number[entities_to_geometry(domain.mesh, 2, local)]
-        behind = domain.element_number[cells_of(domain.mesh, local)[0]]
-        nodes_of_sides = elements[behind][:, sides]
-        is_side = (nodes_of_sides[..., None] == on_face[:, None, None]).any(axis=3).all(axis=2)
-        facets, side = np.nonzero(is_side)
-        nodes_of_facets = nodes_of_sides[facets, side] + 1
-        pattern = texts["facets"][str(sides.shape[1])]
-        add("surface", name, rows=_rows(pattern, behind[facets] + 1, side + 1, nodes_of_facets))
+        cells, facet = cells_of(domain.mesh, domain.facets(name))
+        behind = domain.element_number[cells]
+        side, *corners = sides[facet].T
+        nodes_of_facets = elements[behind, corners].T + 1
+        add("surface", name, rows=_rows(pattern, behind + 1, side, nodes_of_facets))
         add("node_set", name, nodes=",".join(map(str, np.unique(nodes_of_facets))))
-    for name in scene.geometry.held_faces(supports):
-        if supports.get(name, Support()).kind != "elastic":
-            add("fixed", name)
-    on_faces = {"pressure": OnFace("inner")} | faces_of(scene.loads)
-    for name, value in values_of_loads(scene.loads, time).items():
-        if name in on_faces and on_faces[name].kind == "pressure":
-            add("pressure", on_faces[name].face, value=value)
+    _add_conditions(add, scene, domain, nodes, time)
     parts["node"] = [_rows(texts["node"], nodes + 1, fibres.points[nodes])]
     filled = {key: "\n".join(parts[key]) for key in texts}
     filled["units"] = f"lengths: {unit_of(scene, 'length')}, stresses: {unit_of(scene, 'stress')}"
     text = texts["document"].format(**filled)
+    # CalculiX reads 20 characters of a number.
+    text = re.sub(r"[-+.\de]{21,}", lambda number: f"{float(number[0]):.13g}", text)
     text = re.sub(rf"((?:\d+,){{{texts['per_line']}}})(?=\d)", r"\1\n", text)
     _write(path, re.sub(r"\n\n+", "\n", text))
 

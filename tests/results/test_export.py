@@ -20,7 +20,7 @@ from tests.conftest import Refused
 from tests.mesh_files import NAMES, write_tube
 from tests.results.test_stress_on_the_body import SCENES
 from tests.tables import of_csv, rows
-from tests.values import ramp_to
+from tests.values import TURN, ramp_to
 
 RAMP = ramp_to(3.0)
 TUBE: dict[str, Any] = {
@@ -35,7 +35,8 @@ MESHES = {
     "quadratic hexahedra": {"degree": 2},
     "quadratic tetrahedra": {"element": "tetrahedron", "degree": 2},
 }
-LAYERS = TUBE | {"regions": {"media": {"outer_radius": 1.5}, "adventitia": {}}}
+MEDIA = {"outer_radius": 1.5, "material": {"lame_lambda": 5.0, "lame_mu": 2.0}}
+LAYERS = TUBE | {"regions": {"media": MEDIA, "adventitia": {}}}
 # nodes of an element that lie between two of its corners: Abaqus, C3D20 and C3D10; FEBio counts like it
 BETWEEN = {
     20: [
@@ -120,7 +121,7 @@ class Solid:
     def __init__(self) -> None:
         self.nodes, self.elements, self.parts, self.faces = {}, {}, {}, {}
         self.a, self.d, self.dimensions, self.pressures = {}, {}, {}, {}
-        self.fixed, self.kind = [], ""
+        self.fixed, self.materials, self.kind = {}, {}, ""
 
     def tensors(self) -> np.ndarray:
         """A of the elements by their number, which begins with 1."""
@@ -140,6 +141,7 @@ def read_febio(path: Path) -> Solid:
     """FEBio User Manual 4 (names of tags in febio.txt): lid counts the elements of the set that a part names."""
     root, solid = ElementTree.parse(path).getroot(), Solid()
     known = {tag: names.split() for tag, names in rows(__file__, "febio.txt")}
+    assert [part.tag for part in root] == known[root.tag][:-1]
     for one in root.iter():
         types = [one.attrib["type"].replace(" ", "-")] if "type" in one.attrib else []
         assert {part.tag for part in one} | {*one.attrib} | {*types} <= {*known[one.tag]}, one.tag
@@ -159,7 +161,16 @@ def read_febio(path: Path) -> Solid:
                 solid.dimensions.setdefault(element, []).append(float(one.text or ""))
     for surface in root.iter("Surface"):
         solid.faces[surface.attrib["name"]] = [[*map(int, numbers(f.text))] for f in surface]
-    solid.fixed = [bc.attrib["node_set"] for bc in root.iter("bc")]
+    sets = {one.attrib["name"]: {*numbers(one.text)} for one in root.iter("NodeSet")}
+    for bc in root.iter("bc"):
+        solid.fixed |= {dof.tag[0]: sets[bc.attrib["node_set"]] for dof in bc if dof.text == "1"}
+    materials = {one.attrib["name"]: one for one in root.iter("material")}
+    assert [one.attrib["id"] for one in materials.values()] == [
+        *map(str, range(1, len(materials) + 1))
+    ]
+    for domain in root.iter("SolidDomain"):
+        E, v = (float(one.text or "") for one in materials[domain.attrib["mat"]])
+        solid.materials[domain.attrib["name"]] = E * v / (1 + v) / (1 - 2 * v), E / 2 / (1 + v)
     for load in root.iter("surface_load"):
         solid.pressures[load.attrib["surface"]] = float(load[0].text or "")
     return solid
@@ -180,6 +191,8 @@ ABAQUS_SIDES = {
 def read_abaqus(path: Path) -> Solid:
     """Abaqus Keywords Reference Guide: keyword lines, data lines, ** comments; after a comma a data line goes on."""
     solid, text = Solid(), path.read_text()
+    mesh, materials = meshio.read(path, file_format="abaqus"), {}
+    assert max(map(len, re.findall(r"[-+.\de]+", text))) <= 20  # CalculiX reads no more
     assert max(line.count(",") for line in text.splitlines()) <= 16 and "\n\n" not in text
     for keyword, said, body in re.findall(
         r"^\*(\w[^,\n]*)(.*)\n((?:[^*].*\n)*)", re.sub(r"^\*\*.*\n", "", text, flags=re.M), re.M
@@ -199,7 +212,19 @@ def read_abaqus(path: Path) -> Solid:
                 for e, side in lines
             ]
         elif keyword == "BOUNDARY":
-            solid.fixed += [name for name, *dofs in lines if dofs == ["1", "3"]]
+            for name, first, last in lines:
+                assert first == last
+                nodes = np.array([*solid.nodes])[mesh.point_sets[name]].tolist()
+                solid.fixed["xyz"[int(first) - 1]] = {*nodes}
+        elif keyword == "MATERIAL":
+            material = options["NAME"]
+        elif keyword == "HYPERELASTIC":
+            assert "NEO HOOKE" in said
+            C10, D1 = map(float, lines[0])
+            materials[material] = 2 / D1 - 4 * C10 / 3, 2 * C10
+        elif keyword == "SOLID SECTION":
+            assert options["ORIENTATION"] == "CELLS"
+            solid.materials[options["ELSET"]] = materials[options["MATERIAL"]]
         elif keyword == "DSLOAD":
             solid.pressures |= {face: float(value) for face, _, value in lines}
         elif keyword == "DISTRIBUTION":
@@ -208,6 +233,7 @@ def read_abaqus(path: Path) -> Solid:
                 solid.a[int(element)], solid.d[int(element)] = axes[:3], axes[3:]
     for element, length in re.findall(r"^\*\* (\d+),(.*)$", text, re.M):
         solid.dimensions.setdefault(int(element), []).append(float(length))
+    np.testing.assert_array_equal(mesh.points, [solid.nodes[n] for n in sorted(solid.nodes)])
     return solid
 
 
@@ -272,17 +298,64 @@ def test_faces_close_around_the_body(kind: str, reader: Any, start: Path) -> Non
     assert np.abs(total).max() < 1e-9 and volume == pytest.approx(8 * np.sqrt(8), rel=1e-9)
 
 
-def test_an_own_vessel_has_parts_fixed_ends_and_pressures(tmp_path: Path) -> None:
-    """At half of the ramps; springs around it are no condition."""
-    mesh = write_tube(tmp_path / "a.msh", "tetrahedron", renamed=NAMES | {"outer": "1 out"})
+READERS = {"febio": read_febio, "abaqus": read_abaqus}
+
+
+@pytest.mark.parametrize("kind", READERS)
+def test_regions_have_their_matrix_and_a_tube_its_ends(
+    kind: str, start: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    """Lame constants from E and v or C10 and D1; planes of the ends, and three nodes against rigid motions."""
+    solid = READERS[kind](exported(start, kind))
+    assert solid.materials.keys() == solid.parts.keys() == {"media", "adventitia"}
+    assert solid.materials["media"] == pytest.approx((5.0, 2.0))
+    assert solid.materials["adventitia"] == pytest.approx((27.293, 3.103))
+    assert solid.fixed["z"] == {n for n, (_, _, z) in solid.nodes.items() if z in (0.0, 1.0)}
+    assert [len(solid.fixed[axis]) for axis in "xy"] == [1, 2]
+    assert ": loads.elongation (left out)\n" in caplog.text
+
+
+@pytest.mark.parametrize("turned", [False, True])
+@pytest.mark.parametrize("kind", READERS)
+def test_an_own_vessel_has_what_its_supports_hold(
+    kind: str, turned: bool, tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    """A held outlet, a guided inlet if its plane is one of the axes', pressures at half of the ramps; no springs."""
+    names = NAMES | {"outer": "1 out"}
+    mesh = write_tube(
+        tmp_path / "a.msh", "tetrahedron", turn=TURN if turned else None, renamed=names
+    )
     scene = SCENES["vessel"]
     scene["geometry"]["file"] = str(mesh)
-    vessel = run(Scene(**scene), tmp_path / "run")
-    for kind, reader in (("febio", read_febio), ("abaqus", read_abaqus)):
-        solid = reader(path := exported(vessel, kind))
-        assert len(solid.parts) == 1 and sorted(solid.fixed) == ["inlet", "outlet"]
-        assert solid.pressures == pytest.approx({"inner": 0.3, "outer": 0.1})
-        assert "lengths: mm, stresses: kPa" in path.read_text()
+    solid = READERS[kind](path := exported(run(Scene(**scene), tmp_path / "run"), kind))
+    said = "left out" if turned else "simplified"
+    assert f": supports.inlet ({said}), supports.outer (left out)\n" in caplog.text
+    assert solid.pressures == pytest.approx({"inner": 0.3, "outer": 0.1})
+    assert "lengths: mm, stresses: kPa" in path.read_text() and len(solid.parts) == 1
+    inlet, outlet = (
+        {n for facet in solid.faces[end] for n in facet} for end in ("inlet", "outlet")
+    )
+    guided = {axis: solid.fixed[axis] - outlet for axis in "xyz"}
+    assert all(outlet <= nodes for nodes in solid.fixed.values())
+    if turned:
+        assert not any(guided.values())
+        return
+    assert guided.pop("z") == inlet
+    for axis, nodes in guided.items():  # around the centre
+        places = {n: solid.nodes[n]["xy".index(axis)] for n in inlet}
+        assert nodes == {n for n, place in places.items() if abs(place) < 1e-9} and len(nodes) > 3
+
+
+def test_a_cube_has_its_planes_of_symmetry(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    cube = {"geometry": {"shape": "cube"}, "model": {"kinematics": "full"}, "time": {"end": 1.0}}
+    folder = run(Scene(preset="kuhl-holzapfel-2007", **cube), tmp_path / "run")
+    for kind, reader in READERS.items():
+        solid = reader(exported(folder, kind))
+        for i, axis in enumerate("xyz"):
+            assert solid.fixed[axis] == {n for n, place in solid.nodes.items() if place[i] == 0.0}
+    assert caplog.text.count(": loads.force (left out)\n") == 2
 
 
 def test_what_means_of_elements_leave_out_is_said(
