@@ -208,7 +208,8 @@ def _add_conditions(
     from remodel_fenicsx.body.domain import dof_of_node
     from remodel_fenicsx.body.loading import Loading, values_of_loads
 
-    shape, supports, loads = scene.geometry, scene.supports, scene.each_case()[0].loads
+    shape, supports = scene.geometry, scene.supports
+    loads = scene.each_case()[0].loads
     loading = Loading(domain, KINEMATICS["full"].unknown(domain.mesh, scene.mesh.degree))
     shape.support(loading, supports.ends, loads)
     shape.hold_faces(loading, supports.faces, 1.0, loads)
