@@ -21,7 +21,7 @@ WALL = Wall.from_regions(1.0, 3.0, 8, {})
 
 # file -> what is in it, as in the paper: Figs. 6 and 7
 MESHES = {
-    "tendon.msh": lambda: draw_tendon(length=10.0, area=10.0),
+    "tendon.msh": lambda: draw_tendon(10.0, 10.0, 1, "hexahedron", 1),
     "artery.msh": lambda: draw_tube(WALL, 8.0, (16, 12), "hexahedron", 1),
 }
 

@@ -388,7 +388,7 @@ def write_wall(
         wall.points[nodes] - nearest(wall.points, _halved(inner), wall.points[nodes])[1], axis=1
     )
     lines = [
-        f"{path}: {len(wall.tetrahedra)} tetrahedra of degree 2, " f"{through} through the wall",
+        f"{path}: {len(wall.tetrahedra)} tetrahedra of degree 2, {through} through the wall",
         f"thickness {between.min():.4g} to {between.max():.4g} at the nodes",
         f"faces {', '.join(wall.faces)}; "
         + (f"regions {', '.join(shares)}" if shares else "one region"),
