@@ -12,6 +12,7 @@ from contextlib import closing, suppress
 from dataclasses import dataclass, field, replace
 from functools import cached_property, partial
 from itertools import pairwise, zip_longest
+from operator import attrgetter
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING, Annotated, Literal
@@ -668,13 +669,18 @@ FIT_TOLERANCE = 1e-6
 # Largest error of a predicted change of the residuals, over the change. If it is larger, the next
 # Jacobian is computed by differences.
 TELLING = 0.5
-CORRELATED = 0.9  # smallest correlation of two unknowns for which profiles are computed
-PROFILE_STEPS = (-4, -2.5, -1.5, 0, 1.5, 2.5, 4)  # standard deviations of the linear model
-# Like FIT_TOLERANCE, for the fits of a profile, which start at the end that the linear model
-# predicts, and for all fits before the last.
+# Smallest correlation of two unknowns that is named, and of an unknown with all others together
+# for which its profile is computed.
+CORRELATED = 0.9
+PROFILE_END = 1e-2  # change of the end of an interval, over half of the interval, that is accepted
+MAX_PROFILE_FITS = 15  # for one end of an interval
+PROFILE_EXTRAPOLATION = 3.0  # over the distance of the two last points of a profile
+LOWER_MINIMUM = 0.1  # decrease of the sum of squares in a profile with which the fit continues
+# Like FIT_TOLERANCE, for the fits of a profile and for all fits before the last.
 PROFILE_TOLERANCE = 1e-4
 # RMS of the normalised residuals. By the noise of ten rows alone it is below 1.35 at 95 %.
 LIMITED_BY_MODEL = 1.5
+FRACTION_MARGIN = 1e-12  # distance of a logarithm from the bound that the sum of fractions sets
 NORMAL_95 = 1.959963984540054  # standard deviations on each side, normal distribution
 
 
@@ -685,10 +691,22 @@ class Problem:
         self.scene, self.unknowns = scene, dict(unknowns)
         self.tables = list(tables)
         self.fitted = [table for table in tables if table.is_fitted]
-        self.bounds = np.log([unknown.bounds for unknown in unknowns.values()])
+        keys, self.bounds = [*unknowns], np.log([unknown.bounds for unknown in unknowns.values()])
+        # Pairs of fractions, whose sum is at most 1. The bound of a single one is constant.
+        pairs = [(key, f"{key[:-1]}y") for key in keys if key.endswith("cells.fraction_x")]
+        numbers = [[keys.index(x), keys.index(y)] for x, y in pairs if y in keys]
+        self.fractions = np.array(numbers, np.int64).reshape(-1, 2)
+        self.bounds[:, 1] = self.upper(self.bounds[:, 0])
         self.known: dict[Point, Array] = {}
         self.journal: Path | None = None
         self.kept = SimulationCache(tuple(unknowns))
+
+    def upper(self, logarithms: Array) -> Array:
+        """Return the upper bound of each logarithm, (n,), if the others have these values."""
+        upper, pairs = self.bounds[:, 1].copy(), self.fractions
+        rest = np.log1p(-np.exp(logarithms[pairs[:, ::-1]])) - FRACTION_MARGIN
+        upper[pairs] = np.minimum(upper[pairs], rest)
+        return upper
 
     def begin(self, folder: Path, mark: str) -> None:
         """Start the journal in the folder with all evaluated points, without a truncated line."""
@@ -768,10 +786,10 @@ class Problem:
 
     def jacobian(self, logarithms: Array, central: bool = False) -> Array:
         """Compute the derivatives, (residuals, unknowns), by differences of runs."""
-        columns = []
+        columns, upper = [], self.upper(logarithms)
         for k, change in enumerate(LOGARITHM_CHANGE * np.eye(len(logarithms))):
             ahead, behind = (
-                np.clip(logarithms + side * change, *self.bounds.T) for side in (1, -1)
+                np.clip(logarithms + side * change, self.bounds[:, 0], upper) for side in (1, -1)
             )
             if not central:
                 behind, ahead = (
@@ -916,9 +934,9 @@ def fit(
                 "sum of squares of each start: %s",
                 ", ".join(f"{2 * end.cost:.6g}" for end in minima),
             )
-            result = result_of(problem, minima)
-            if profiles:
-                result = with_profiles(problem, result, on_cores)
+            result = (
+                with_profiles(problem, minima, on_cores) if profiles else result_of(problem, minima)
+            )
         log.info("%s", result.verdict())
         write_whole(
             place / "scene.toml", result.scene.to_toml(f"fitted to {Path(data).name}").encode()
@@ -971,12 +989,16 @@ def minimised(
     from scipy.optimize import least_squares
 
     free = np.array([number != held for number in range(len(start))])
-    bounds = problem.bounds[free].T
+    (lower, upper), bounds = problem.bounds.T, problem.bounds[free].T
+    start = np.clip(start, lower, upper)
+    last = [x if y == held else y for x, y in problem.fractions]
 
     def whole(x: Array) -> Array:
+        # SciPy's bounds are constant: the bound that a fraction leaves the last one shifts it.
         point = start.copy()
         point[free] = x
-        return point
+        point[last] += (problem.upper(point) - upper)[last]
+        return np.maximum(point, lower)
 
     def jacobian(x: Array) -> Array:
         nonlocal near
@@ -987,23 +1009,27 @@ def minimised(
             if np.linalg.norm(missed) <= TELLING * np.linalg.norm(change):
                 updated = near[1] + np.outer(missed, step) / max(float(step @ step), 1e-300)
         near = point, problem.jacobian(point) if updated is None else updated
-        return near[1][:, free]
+        steps = 1e-6 * np.eye(len(x))
+        return near[1] @ np.transpose([whole(x + step) - whole(x - step) for step in steps]) / 2e-6
 
-    inside = np.clip(start[free], bounds[0] + 1e-6, bounds[1] - 1e-6)
-    return least_squares(
+    first = start.copy()
+    first[last] -= (problem.upper(start) - upper)[last]
+    end = least_squares(
         lambda x: problem.residuals(whole(x)),
-        inside,
+        np.clip(first[free], bounds[0] + 1e-6, bounds[1] - 1e-6),
         jacobian,
         bounds,
         x_scale="jac",
         xtol=enough,
         ftol=enough,
     )
+    end.x, end.near = whole(end.x), near
+    return end
 
 
 def result_of(problem: Problem, ends: Sequence[OptimizeResult]) -> Fit:
     """Return the best of several minima, with its covariance."""
-    logarithms: Array = min(ends, key=lambda end: float(end.cost)).x
+    logarithms: Array = min(ends, key=attrgetter("cost")).x
     jacobian = problem.jacobian(logarithms, central=True)
     problem.check_identifiable(jacobian)
     misfit = float(np.sqrt(np.mean(problem.residuals(logarithms) ** 2)))
@@ -1013,42 +1039,70 @@ def result_of(problem: Problem, ends: Sequence[OptimizeResult]) -> Fit:
     return Fit(scene, problem, logarithms, covariance, misfit, minima, models)
 
 
+def profile_end(
+    problem: Problem, best: OptimizeResult, step: Array, width: float, held: int
+) -> OptimizeResult:
+    """Return the lowest point of an unknown's profile, with the `end` of the confidence interval.
+
+    The first point is that of the linear model, a step from the best fit.
+    """
+    from scipy.optimize import OptimizeResult
+
+    # The root of the increase of the sum of squares, `width` at the end, is nearly linear.
+    known, fit = [(0.0, best)], best
+    point = best.x + step
+    near = best.x, problem.jacobian(best.x, central=True)
+    while len(known) <= MAX_PROFILE_FITS:
+        point = np.clip(point, *problem.bounds.T)
+        if abs(point - fit.x)[held] <= PROFILE_END * abs(point - best.x)[held]:
+            break
+        fit = minimised(problem, point, held, near, PROFILE_TOLERANCE)
+        near = fit.near
+        known.append((np.sqrt(max(2 * (fit.cost - best.cost), 0.0)), fit))
+        known.sort(key=lambda one: float(abs(one[1].x - best.x)[held]))
+        beyond = [number for number, (root, _) in enumerate(known) if root > width]
+        outside = [*beyond, len(known) - 1][0]
+        (low, inner), (high, outer) = known[outside - 1 : outside + 1]
+        share = (width - low) / max(high - low, (width - low) / PROFILE_EXTRAPOLATION)
+        point = inner.x + share * (outer.x - inner.x)
+    lowest = min((fit for _, fit in known), key=attrgetter("cost"))
+    return OptimizeResult(lowest, end=np.clip(point, *problem.bounds.T)[held])
+
+
 def with_profiles(
-    problem: Problem, result: Fit, on_cores: Callable[[Mapping[str, Task]], list[OptimizeResult]]
+    problem: Problem,
+    minima: Sequence[OptimizeResult],
+    on_cores: Callable[[Mapping[str, Task]], list[OptimizeResult]],
 ) -> Fit:
-    """Return the fit with likelihood profiles of correlated unknowns.
+    """Return the fit with likelihood profiles of correlated unknowns, or of all near a bound.
 
     At each value of such an unknown all other unknowns are fitted again.
     """
-    best, ends = result.logarithms, problem.bounds.T
-    least = float(np.sum(problem.residuals(best) ** 2))
-    near = best, problem.jacobian(best, central=True)
-    chosen = np.flatnonzero((np.abs(result.correlations) > CORRELATED).sum(axis=0) > 1)
-    directions = result.inflation * result.covariance[chosen] / result.deviations[chosen, None]
-    # (steps, chosen, unknowns)
-    points = np.clip(best + np.multiply.outer(PROFILE_STEPS, directions), *ends)
+    result, best = result_of(problem, minima), min(minima, key=attrgetter("cost"))
+    covariance, width = result.covariance, NORMAL_95 * result.inflation
+    independent = 1 / (np.diag(covariance) * np.diag(np.linalg.inv(covariance)))
+    steps = width * covariance / result.deviations[:, None]
+    room = np.minimum(problem.upper(best.x) - best.x, best.x - problem.bounds[:, 0])
+    # A bound within an interval changes the intervals of all unknowns.
+    chosen = np.flatnonzero(
+        (independent < 1 - CORRELATED**2) | (np.any(steps.diagonal() > room) & (len(room) > 1))
+    )
     tasks = {
-        f"profile of {result.keys[held]} at {steps:+g}": partial(
-            minimised, start=x, held=int(held), near=near, enough=PROFILE_TOLERANCE
+        f"profile of {result.keys[held]}, {name} end": partial(
+            profile_end, best=best, step=side * steps[held], width=width, held=int(held)
         )
-        for steps, row in zip(PROFILE_STEPS, points, strict=True)
-        for held, x in zip(chosen, row, strict=True)
+        for held in chosen
+        for side, name in ((-1, "lower"), (1, "upper"))
     }
-    costs = np.reshape([end.cost for end in on_cores(tasks)], points.shape[:2])
-    profiles = {}
-    for held, values, cost in zip(
-        chosen, points.T[chosen, range(len(chosen))], costs.T, strict=True
-    ):
-        # The root of the increase is nearly linear. The interval ends where it is NORMAL_95; NaN if
-        # that is beyond all points.
-        roots = (
-            np.sign(PROFILE_STEPS) * np.sqrt(np.maximum(2 * cost - least, 0.0)) / result.inflation
-        )
-        beyond = [value if value in ends[:, held] else np.nan for value in values[[0, -1]]]
-        profiles[result.keys[held]] = np.exp(
-            np.interp([-NORMAL_95, NORMAL_95], roots, values, *beyond)
-        )
-    return replace(result, profiles=profiles)
+    ends = on_cores(tasks)
+    lowest = min([best, *ends], key=attrgetter("cost"))
+    if 2 * (best.cost - lowest.cost) > LOWER_MINIMUM * result.inflation**2:
+        log.info("a profile leads to a lower sum of squares, from which the fit continues")
+        lower = on_cores({"from a profile": partial(minimised, start=lowest.x)})
+        return with_profiles(problem, [*minima, *lower], on_cores)
+    limits = np.exp([end.end for end in ends]).reshape(-1, 2)
+    keys = [result.keys[held] for held in chosen]
+    return replace(result, profiles=dict(zip(keys, limits, strict=True)))
 
 
 # ---------------------------------------------------------------- result
@@ -1094,16 +1148,27 @@ class Fit(StudyResult):
 
     @property
     def inflation(self) -> float:
-        """Factor on the confidence intervals: the misfit if the model limits them, else 1."""
-        return self.misfit if self.misfit > LIMITED_BY_MODEL else 1.0
+        """Factor on the confidence intervals if the model limits them, else 1.
+
+        The residuals then estimate the variance, so that Student's distribution holds.
+        """
+        if self.misfit <= LIMITED_BY_MODEL:
+            return 1.0
+        from scipy.special import stdtrit
+
+        count = len(self.problem.residuals(self.logarithms))
+        freedom = max(count - len(self.keys), 1)
+        quantile = stdtrit(freedom, 0.975)
+        return float(self.misfit * np.sqrt(count / freedom) * quantile / NORMAL_95)
 
     @cached_property
     def band(self) -> Array:
-        """95 % confidence limits of the logarithms, (2, n), within the bounds."""
+        """95 % confidence limits of the logarithms, (2, n), by profiles if there are any."""
         half = NORMAL_95 * self.inflation * self.deviations
-        return np.clip(
-            [self.logarithms - half, self.logarithms + half], *self.problem.bounds.T[:, None]
-        )
+        band = np.array([self.logarithms - half, self.logarithms + half])
+        for key, limits in self.profiles.items():
+            band[:, self.keys.index(key)] = np.log(limits)
+        return np.clip(band, *self.problem.bounds.T[:, None])
 
     @property
     def open(self) -> list[str]:
@@ -1121,7 +1186,6 @@ class Fit(StudyResult):
     def table(self) -> dict[str, ArrayLike]:
         """Return the columns of fit.csv, with a row for each unknown."""
         lower, upper = np.exp(self.band)
-        profiles = np.transpose([self.profiles.get(key, [np.nan, np.nan]) for key in self.keys])
         return {
             "key": self.keys,
             "value": self.values,
@@ -1129,8 +1193,7 @@ class Fit(StudyResult):
             "upper": upper,
             "open": self.open,
             "limited_by": [self.limited_by] * len(self.keys),
-            "profile_lower": profiles[0],
-            "profile_upper": profiles[1],
+            "method": ["profile" if key in self.profiles else "linear" for key in self.keys],
             "start": [unknown.start for unknown in self.problem.unknowns.values()],
         }
 
@@ -1142,7 +1205,7 @@ class Fit(StudyResult):
         text += f"{same} of {len(self.minima)} starts end in this minimum."
         if self.limited_by == "model":
             text += " The model limits the accuracy: its residuals exceed the standard deviations, "
-            text += f"so all confidence intervals are {self.misfit:.2g} times as wide."
+            text += f"so all confidence intervals are {self.inflation:.2g} times as wide."
         pairs = np.argwhere(np.triu(np.abs(self.correlations) > CORRELATED, 1))
         together = [f"{keys[i]} and {keys[j]} ({self.correlations[i, j]:+.2f})" for i, j in pairs]
         if together:

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from remodel_fenicsx import Scene, SceneError, cli, read_scene
-from remodel_fenicsx.studies.fit import Measured, read_measurements
+from remodel_fenicsx.studies.fit import Measured, fit, read_measurements
 from tests.conftest import forked_children, warnings_of
 from tests.tables import of_csv, rows as table_rows, unescaped
 
@@ -140,3 +140,29 @@ def test_the_file_of_an_instrument_is_fitted_and_predicts(
     said = capsys.readouterr().out
     (line,) = (line for line in said.splitlines() if "protocol 3, predicted: R²" in line)
     assert float(line.split("R² ")[1].split()[0]) > 0.98
+
+
+def test_the_truth_lies_within_the_intervals_of_fractions_near_their_bound(tmp_path: Path) -> None:
+    """The fitted fractions have a sum of 1, which no point of a profile may exceed."""
+    demo = run_path(str(DEMO / "instrument.py"))
+    truth = {"material.initial_stiffness": 60.0, "cells.fraction_x": 0.6, "cells.fraction_y": 0.395}
+    scene = read_scene(DEMO / "scene.toml").with_values(demo["TRUTH"] | truth)
+    strains, forces = demo["PROTOCOLS"].values(), demo["forces"]
+    stress = 50.0 * np.concatenate([forces(scene, one)[1::2] for one in strains])  # kPa of N
+    noise = np.random.default_rng(4).normal(0.0, 0.3, stress.T.shape).T
+    levels = np.concatenate([np.outer(demo["LEVELS"][1::2], one) for one in strains])
+    names = "elongation_x,elongation_y,nominal_stress_x,nominal_stress_y"
+    data = np.hstack([levels, stress + noise])
+    np.savetxt(tmp_path / "d.csv", data, delimiter=",", header=names, comments="")
+    starts = zip(truth, (40.0, 0.4, 0.4))
+    unknowns = "".join(f'"{key}" = {{ start = {start} }}\n' for key, start in starts)
+    table = (
+        "[[measured]]\nfile = 'd.csv'\nsd = { nominal_stress_x = 0.3, nominal_stress_y = 0.3 }\n"
+    )
+    (tmp_path / "data.toml").write_text(f"[unknowns]\n{unknowns}{table}")
+    with forked_children():
+        _, found = fit(scene, tmp_path / "data.toml", tmp_path / "out", starts=1)
+    assert found.values[1:].sum() == pytest.approx(1.0, abs=1e-3) and found.values[1:].sum() <= 1.0
+    for row in of_csv(tmp_path / "out" / "fit.csv"):
+        assert row["method"] == "profile"
+        assert float(row["lower"]) < truth[row["key"]] < float(row["upper"]), row
