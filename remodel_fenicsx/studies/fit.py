@@ -1209,7 +1209,8 @@ class Fit(StudyResult):
         pairs = np.argwhere(np.triu(np.abs(self.correlations) > CORRELATED, 1))
         together = [f"{keys[i]} and {keys[j]} ({self.correlations[i, j]:+.2f})" for i, j in pairs]
         if together:
-            text += f" Correlated: {', '.join(together)}; trust their profile likelihoods."
+            text += f" Correlated: {', '.join(together)}"
+            text += "." if self.profiles else "; linear intervals are unreliable."
         return text
 
     @property
