@@ -17,6 +17,7 @@ from remodel_fenicsx.evolution.stepper import Step, Watcher
 from remodel_fenicsx.results.columns import Measurement
 from remodel_fenicsx.running import resume, run
 from remodel_fenicsx.scene.scene import scene_from_dict
+from tests.values import assert_close
 
 SELF = MPI.COMM_SELF
 Rows = list[dict[str, float]]
@@ -72,10 +73,14 @@ def opening_angle(simulation: Simulation, release: str = "cut") -> float:
     return _of_rings(release, Measurement(simulation.observer, step))
 
 
+def columns(rows: Rows) -> dict[str, np.ndarray]:
+    """The same by column."""
+    return {name: np.array([row[name] for row in rows]) for name in rows[0]}
+
+
 def columns_of(scene: Scene | Mapping[str, Any], domain: Any = None) -> dict[str, np.ndarray]:
     """Its rows by column."""
-    rows = rows_of(scene, domain)
-    return {name: np.array([row[name] for row in rows]) for name in rows[0]}
+    return columns(rows_of(scene, domain))
 
 
 def goes_on(scene: Scene | Mapping[str, Any], folder: Path, *stops: float) -> Recording:
@@ -87,10 +92,7 @@ def goes_on(scene: Scene | Mapping[str, Any], folder: Path, *stops: float) -> Re
         resume(parts, [f"time.end={end}"], SELF, report=False)
     found = Recording(parts)
     assert list(found.history) == list(whole)
-    for name in set(whole) - {"seconds"}:
-        np.testing.assert_allclose(
-            found.history[name], whole[name], rtol=1e-13, atol=1e-15, err_msg=name
-        )
+    assert_close(found.history, whole, set(whole) - {"seconds"}, 1e-13, 1e-15, equal_nan=True)
     return found
 
 

@@ -18,8 +18,8 @@ from remodel_fenicsx.scene import scene_from_dict
 from remodel_fenicsx.solver.equilibrium import PointStresses
 from tests.conftest import Case
 from tests.parts import tube
-from tests.runs import AtSolved, goes_on, made
-from tests.values import isotropic, ramped
+from tests.runs import AtSolved, columns, goes_on, made
+from tests.values import assert_close, isotropic, ramped
 
 SELF = MPI.COMM_SELF
 END = 4.0
@@ -97,10 +97,8 @@ def test_the_reaction_of_a_prescribed_length_gives_that_length(
     assert min(forces) > 1.0 and np.ptp(forces) > 1.0
     scene = scene_from_dict(values(kinematics, {"axial_force": as_load(forces)}, geometry=geometry))
     found, _ = rows_of(scene)
-    for name in ("axial_elongation", "inner_radius", "stored_energy"):
-        np.testing.assert_allclose(
-            [row[name] for row in found], [row[name] for row in prescribed], rtol=1e-9
-        )
+    names = ("axial_elongation", "inner_radius", "stored_energy")
+    assert_close(columns(found), columns(prescribed), names, 1e-9)
     np.testing.assert_allclose([row["axial_force"] for row in found], forces, rtol=1e-9)
     assert max(row["newton_iterations"] for row in found) <= 6  # one method for field and length
 
@@ -111,10 +109,7 @@ def test_closed_ends_carry_the_force_on_the_caps() -> None:
     assert "axial_force" not in closed[0] and closed[-1]["axial_elongation"] > 1e-3
     forces = [row["pressure"] * np.pi * row["inner_radius"] ** 2 for row in closed]
     pulled, _ = rows_of(scene_from_dict(values("radial", {"axial_force": as_load(forces)})))
-    for name in ("axial_elongation", "inner_radius"):
-        np.testing.assert_allclose(
-            [row[name] for row in pulled], [row[name] for row in closed], rtol=1e-9
-        )
+    assert_close(columns(pulled), columns(closed), ("axial_elongation", "inner_radius"), 1e-9)
     free, _ = rows_of(scene_from_dict(values("radial", ramped(END, axial_force=0.0))))
     assert free[-1]["axial_elongation"] < 0.0 < closed[-1]["axial_elongation"]
 
@@ -139,8 +134,7 @@ def test_the_equilibrium_of_a_closed_tube() -> None:
 def test_one_and_two_ranks_agree(case: Case) -> None:
     scene = values("radial", {}, supports={"ends": "closed"})
     one, two = (case(scene, ranks=ranks) for ranks in (1, 2))
-    for name in ("u", "l", "axial_elongation"):
-        np.testing.assert_allclose(two[name], one[name], rtol=1e-11, atol=1e-11)
+    assert_close(two, one, ("u", "l", "axial_elongation"), 1e-11, 1e-11)
 
 
 # ---------------------------------------------------------------- scenes and records

@@ -13,7 +13,7 @@ from remodel_fenicsx.scene import Scene, scene_from_dict
 from tests.parts import tube
 from tests.reference.radial import solve_radial
 from tests.runs import AtSolved
-from tests.values import ramped, isotropic
+from tests.values import assert_close, isotropic, ramped
 
 SELF = MPI.COMM_SELF
 END = 2.0
@@ -63,11 +63,7 @@ def test_the_half_plane_and_the_quarter_carry_the_force_of_the_ray(tables: dict[
     rays, _ = rows_of(scene("axisymmetric" if clamped else "radial", **tables))
     for name, tolerance in (("axisymmetric", 1e-9), ("sector", 0.04)):
         rows, _ = rows_of(scene(name, **tables))
-        for column in FORCES:
-            assert rows[-1][column] == pytest.approx(rays[-1][column], rel=tolerance), (
-                name,
-                column,
-            )
+        assert_close(rows[-1], rays[-1], FORCES, tolerance)
 
 
 def reaction(simulation: Simulation) -> tuple[float, float]:

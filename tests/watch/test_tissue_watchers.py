@@ -15,7 +15,7 @@ from remodel_fenicsx.system import NOTICE
 from remodel_fenicsx.watch.warnings import VolumeLoss
 from tests.conftest import slowly
 from tests.runs import rows_of, simulated
-from tests.values import PAPER, isotropic, ramp_to, ramped
+from tests.values import PAPER, assert_close, isotropic, ramp_to, ramped
 
 
 def tube_scene(**tables: Any) -> Scene:
@@ -158,8 +158,7 @@ ON_ONE_AND_TWO_RANKS = [{"scene": WHOLE, "divisions": [8, 4, 1]}]
 def test_one_and_two_ranks_agree(both_ranks: Any) -> None:
     """Of random cells on the whole tube: forces, shares and angles."""
     ((one, two),) = both_ranks
-    for name in COLUMNS:
-        np.testing.assert_allclose(two[name], one[name], rtol=1e-10)
+    assert_close(two, one, COLUMNS, 1e-10)
 
 
 # ---------------------------------------------------------------- weak loads
