@@ -62,6 +62,16 @@ def rows_of(
         return rows
 
 
+def rows_and_looks(
+    scene: Scene | Mapping[str, Any], look: Callable[[Simulation], Any], domain: Any = None
+) -> tuple[Rows, list[Any]]:
+    """All rows, and what `look` finds in the simulation at each solved state."""
+    found: list[Any] = []
+    with made(scene, domain) as simulation:
+        watcher = AtSolved(lambda step: found.append(look(simulation)))
+        return [dict(step.row) for step in simulation.steps([watcher])], found
+
+
 def last_row(scene: Scene | Mapping[str, Any], domain: Any = None) -> dict[str, float]:
     """The row of its end."""
     return rows_of(scene, domain)[-1]
