@@ -92,6 +92,15 @@ def pulled_cube(end: float, **tables: Any) -> Scene:
     )
 
 
+def clamped_cube() -> Body:
+    """Eight elements of random cells, the bottom clamped, a dead force on the top."""
+    made = body(cube(refinement=2), Cells(initial="random", seed=3))
+    for component in range(3):
+        made.loading.hold_face("z0", component)
+    made.loading.add_dead_force("force", "z1", component=2)
+    return made
+
+
 def random_rotations(rng: np.random.Generator, count: int) -> np.ndarray:
     """Rotations, (count, 3, 3)."""
     matrices = np.linalg.qr(rng.standard_normal((count, 3, 3)))[0]

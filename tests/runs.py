@@ -17,6 +17,7 @@ from remodel_fenicsx.evolution.stepper import Step, Watcher
 from remodel_fenicsx.results.columns import Measurement
 from remodel_fenicsx.running import resume, run
 from remodel_fenicsx.scene.scene import scene_from_dict
+from tests.values import assert_close
 
 SELF = MPI.COMM_SELF
 Rows = list[dict[str, float]]
@@ -61,6 +62,16 @@ def rows_of(
         return rows
 
 
+def rows_and_looks(
+    scene: Scene | Mapping[str, Any], look: Callable[[Simulation], Any], domain: Any = None
+) -> tuple[Rows, list[Any]]:
+    """All rows, and what `look` finds in the simulation at each solved state."""
+    found: list[Any] = []
+    with made(scene, domain) as simulation:
+        watcher = AtSolved(lambda step: found.append(look(simulation)))
+        return [dict(step.row) for step in simulation.steps([watcher])], found
+
+
 def last_row(scene: Scene | Mapping[str, Any], domain: Any = None) -> dict[str, float]:
     """The row of its end."""
     return rows_of(scene, domain)[-1]
@@ -72,10 +83,14 @@ def opening_angle(simulation: Simulation, release: str = "cut") -> float:
     return _of_rings(release, Measurement(simulation.observer, step))
 
 
+def columns(rows: Rows) -> dict[str, np.ndarray]:
+    """The same by column."""
+    return {name: np.array([row[name] for row in rows]) for name in rows[0]}
+
+
 def columns_of(scene: Scene | Mapping[str, Any], domain: Any = None) -> dict[str, np.ndarray]:
     """Its rows by column."""
-    rows = rows_of(scene, domain)
-    return {name: np.array([row[name] for row in rows]) for name in rows[0]}
+    return columns(rows_of(scene, domain))
 
 
 def goes_on(scene: Scene | Mapping[str, Any], folder: Path, *stops: float) -> Recording:
@@ -87,10 +102,7 @@ def goes_on(scene: Scene | Mapping[str, Any], folder: Path, *stops: float) -> Re
         resume(parts, [f"time.end={end}"], SELF, report=False)
     found = Recording(parts)
     assert list(found.history) == list(whole)
-    for name in set(whole) - {"seconds"}:
-        np.testing.assert_allclose(
-            found.history[name], whole[name], rtol=1e-13, atol=1e-15, err_msg=name
-        )
+    assert_close(found.history, whole, set(whole) - {"seconds"}, 1e-13, 1e-15, equal_nan=True)
     return found
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable, Mapping
 from typing import Any
 
 import numpy as np
@@ -34,6 +35,27 @@ def isotropic(
     }
     values |= {"cells": {"initial": "isotropic"}, "output": {"fields": False}, **tables}
     return {name: table for name, table in values.items() if table is not None}
+
+
+def assert_close(
+    found: Mapping[str, Any],
+    expected: Mapping[str, Any],
+    names: Iterable[str],
+    rtol: float = 0.0,
+    atol: float = 1e-12,
+    equal_nan: bool = False,
+) -> None:
+    """Numbers or arrays of these names, of rows, columns or fields."""
+    for name in names:
+        np.testing.assert_allclose(
+            found[name], expected[name], rtol, atol, equal_nan=equal_nan, err_msg=name
+        )
+
+
+def assert_orthonormal(axes: np.ndarray, atol: float = 1e-12) -> None:
+    """Rows of matrices (..., 3, 3)."""
+    products = axes @ np.swapaxes(axes, -1, -2)
+    np.testing.assert_allclose(products, np.broadcast_to(np.eye(3), axes.shape), atol=atol)
 
 
 TENSION = {"rates": "tension", "volume": 0.0}

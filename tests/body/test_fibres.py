@@ -21,6 +21,7 @@ from remodel_fenicsx.running import resume
 from tests.results.test_export import TUBE
 from tests.runs import SELF, last_row, made
 from tests.tables import of_csv, rows, unescaped
+from tests.values import ANGLES, assert_close
 
 R0 = 0.9
 
@@ -310,14 +311,7 @@ def test_one_and_two_ranks_have_the_same(both_ranks: Any) -> None:
     """Each element another angle."""
     ((one, two),) = both_ranks
     assert np.ptp(one["n"][:, 0, 0], axis=0).max() > 0.4
-    for name in (
-        "n",
-        "inner_radius",
-        "fibre_angle_inner",
-        "fibre_angle_middle",
-        "fibre_angle_outer",
-    ):
-        np.testing.assert_allclose(two[name], one[name], rtol=0, atol=1e-9, err_msg=name)
+    assert_close(two, one, ("n", "inner_radius", *ANGLES), atol=1e-9)
 
 
 def test_angles_of_a_sheet_are_measured_from_x() -> None:

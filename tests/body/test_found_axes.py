@@ -16,6 +16,7 @@ from mpi4py import MPI
 from remodel_fenicsx.body.axes import MOST_UNDEFINED, UndefinedAxes
 from tests import own_bodies, parts
 from tests.own_bodies import KnownBody, apart, bent, elliptic, fork, found, ring, straight
+from tests.values import assert_orthonormal
 
 TORUS = bent((1.0, 2.0), bend=6.0, angle=np.pi / 3)
 BODIES = {
@@ -114,9 +115,7 @@ def test_axes_are_a_right_handed_frame_and_a_turned_body_has_turned_ones() -> No
     )
     second, _ = found(moved)
     axes = first.axes
-    np.testing.assert_allclose(
-        axes @ np.swapaxes(axes, -1, -2), np.broadcast_to(np.eye(3), axes.shape), atol=1e-12
-    )
+    assert_orthonormal(axes)
     np.testing.assert_allclose(
         np.cross(axes[..., 0, :], axes[..., 1, :]), axes[..., 2, :], atol=1e-12
     )

@@ -98,7 +98,6 @@ def test_two_layers_on_one_radius_are_those_of_the_reference(law: str) -> None:
     radius, media, adventitia = held_against(
         law, Simulation(scene(law=law, **{"mesh.refinement": 4}), SELF)
     )
-    print(law, radius, media, adventitia)
     assert radius < 3e-4 and media < 0.1 and adventitia < 0.1
 
 
@@ -122,7 +121,6 @@ def test_two_layers_in_three_dimensions_are_those_of_the_reference() -> None:
     full = scene(**{"model.kinematics": "full"})
     domain = whole_tube(full.geometry, (8, 8, 1), "hexahedron", 2, SELF, full.regions)  # type: ignore[arg-type]
     radius, media, adventitia = held_against("explicit", Simulation(full, SELF, domain))
-    print(radius, media, adventitia)
     assert radius < 3e-3 and media < 0.2 and adventitia < 0.2
 
 

@@ -19,7 +19,7 @@ from tests.body.test_natural import layers, scene
 from tests.body.test_stresses import NAMES
 from tests.runs import goes_on, last_row, made
 from tests.tables import rows, values
-from tests.values import TURN, ramp_to
+from tests.values import TURN, assert_close, ramp_to
 
 SELF = MPI.COMM_SELF
 MEDIA, ADVENTITIA = {"circumferential": 1.05, "axial": 0.95}, {"axial": 1.1}
@@ -44,9 +44,7 @@ def test_all_kinematics_agree_with_one_radius(law: str, kinematics: list[str]) -
         )
         ends.append(last_row(of, domain))
     for row in ends[1:]:
-        assert [row[name] for name in names] == pytest.approx(
-            [ends[0][name] for name in names], rel=1e-4, abs=1e-5
-        )
+        assert_close(row, ends[0], names, 1e-4, 1e-5)
 
 
 def test_a_wall_thinner_than_its_elements_are_flat_is_refused() -> None:
@@ -98,8 +96,7 @@ def test_layers_of_a_file_come_to_rest_as_the_closing_of_a_ring_says(
     turned = last_row(
         own_body(write_layers(tmp_path / "turned.msh", free, TURN), closed.axial - 1.0)
     )
-    for column in ("lumen_volume", "outer_area", "stored_energy"):
-        assert turned[column] == pytest.approx(row[column], rel=1e-6), column
+    assert_close(turned, row, ("lumen_volume", "outer_area", "stored_energy"), 1e-6)
 
 
 def test_a_prestretch_that_is_given_back_leaves_no_stress(two_layers: Path) -> None:
@@ -136,8 +133,7 @@ def test_an_own_body_begins_in_balance_without_loads(
         ):
             start = simulation.stepper.start(simulation.watchers)
             row = next(iter(simulation.steps())).row
-        for name in ("lumen_volume", "outer_area", *NAMES):
-            assert start.row[name] == pytest.approx(row[name], rel=1e-8, abs=1e-8), name
+        assert_close(start.row, row, ("lumen_volume", "outer_area", *NAMES), 1e-8, 1e-8)
         assert start.work.substeps >= parts and "prestretched body equilibrated" in caplog.text
 
 

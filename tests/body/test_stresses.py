@@ -1,4 +1,7 @@
-"""Stresses as columns: against the one-dimensional reference, the law of Laplace, and each other's kinematics."""
+"""Stresses as columns: against the one-dimensional reference and the law of Laplace.
+
+Those of all kinematics are compared in test_natural_bodies.py.
+"""
 
 from __future__ import annotations
 
@@ -23,7 +26,7 @@ from tests.reference.radial import (
 )
 from tests.parts import rotation, tube
 from tests.runs import last_row, simulated
-from tests.values import ramp_to, ramped
+from tests.values import assert_close, ramp_to, ramped
 
 ELEMENTS, END = 8, 30.0
 MIDDLE = slice(9, 15)  # three Gauss points of each of the two elements at the middle radius
@@ -109,22 +112,6 @@ def test_the_mean_around_is_that_of_the_law_of_laplace(changes: dict[str, Any]) 
     )
 
 
-def test_a_half_plane_has_the_same() -> None:
-    """The sector and the whole tube too: tests/body/test_natural_bodies.py."""
-    short = {
-        "time.end": 3.0,
-        "loads.pressure.ramp": ramp_to(3.0),
-        "loads.pressure.value": 1.5,
-    }
-    short |= {"remodeling.law": "none"}
-    one, other = (
-        last_row(artery(**short, **{"model.kinematics": name}))
-        for name in ("radial", "axisymmetric")
-    )
-    for name in (*NAMES, "mean_hoop_stress"):
-        assert other[name] == pytest.approx(one[name], rel=1e-6, abs=1e-6), name
-
-
 def test_regions_and_a_mesh_of_ones_own_have_them(tmp_path: Path) -> None:
     """Two layers of a tube; a mesh file of one tissue beside the same tube on one radius."""
     tables: dict[str, Any] = {
@@ -154,9 +141,7 @@ def test_regions_and_a_mesh_of_ones_own_have_them(tmp_path: Path) -> None:
     found = scene_from_dict(
         {"geometry": own, "supports": supports, "output": {"columns": names}, **tables}
     )
-    one, other = last_row(exact), last_row(found)
-    for name in names:
-        assert other[name] == pytest.approx(one[name], rel=0.02), name
+    assert_close(last_row(found), last_row(exact), names, 0.02)
     with pytest.raises(SceneError, match="output.columns = .*hoop_stress_intima"):
         layered.with_values({"output.columns": ["hoop_stress_intima"]})
 

@@ -21,11 +21,10 @@ from remodel_fenicsx.results.whole_body import WholeBody
 from remodel_fenicsx.schema.settings import CONSTANT_FIELDS
 from remodel_fenicsx.simulation import Simulation
 from tests import parts
-from tests.values import isotropic, ramped
+from tests.mesh_files import NAMES
+from tests.values import ANGLES, assert_close, isotropic, ramped
 
-ANGLES = [f"fibre_angle_{place}" for place in ("inner", "middle", "outer")]
 COUNTS = (8, 8, 2)
-RENAMED = {"bottom": "inlet", "top": "outlet", "inner": "inner", "outer": "outer"}
 
 
 class WalledTube(WalledMesh):
@@ -45,7 +44,7 @@ class WalledTube(WalledMesh):
         tube = Tube(inner_radius=1.0, outer_radius=3.0, length=self.length)
         made = whole_tube(tube, COUNTS, mesh.element, mesh.degree, comm)
         return replace(
-            made, faces={RENAMED[face]: tag for face, tag in made.faces.items()}, shape="walled"
+            made, faces={NAMES[face]: tag for face, tag in made.faces.items()}, shape="walled"
         )
 
     def hold(self, loading: Any) -> None:
@@ -89,8 +88,7 @@ def test_rows_are_those_of_the_tube() -> None:
     assert found.scene.cells.axes == "local" and expected.scene.cells.axes == "cylindrical"
     np.testing.assert_allclose(found.cells.axis_values, expected.cells.axis_values, atol=1e-9)
     for one, other in zip(found.steps(), expected.steps(), strict=True):
-        for name in (*ANGLES, "radial_share"):
-            assert one.row[name] == pytest.approx(other.row[name], abs=1e-6)
+        assert_close(one.row, other.row, (*ANGLES, "radial_share"), atol=1e-6)
         # at points between plane faces the tube's depth is that of the place, here a share of the way
         assert one.row["angle_profile_3"] == pytest.approx(other.row["angle_profile_3"], abs=1.0)
     assert abs(one.row["fibre_angle_inner"] - one.row["fibre_angle_outer"]) > 1.0

@@ -39,7 +39,7 @@ from tests.runs import (
     taylor_orders,
 )
 from tests.tables import rows, values
-from tests.values import ANGLES, isotropic, ramped
+from tests.values import ANGLES, assert_close, isotropic, ramped
 
 RADII = ["inner_radius", "outer_radius"]
 GROWN = ["content", "natural_length", "growth"]
@@ -204,9 +204,7 @@ def test_a_whole_tube_is_the_one_on_a_radius() -> None:
     scene = passive(names, (1.2, 1.5), kinematics="full", **SHORT)
     whole = last_row(scene, whole_tube(scene.geometry, (16, 4, 1), "hexahedron", 2, SELF))
     radial = last_row(passive(names, (1.2, 1.5), **SHORT))
-    assert [whole[name] for name in names] == pytest.approx(
-        [radial[name] for name in names], rel=1e-3, abs=1e-2
-    )
+    assert_close(whole, radial, names, 1e-3, 1e-2)
 
 
 def own_values(file: Path, **tables: Any) -> dict[str, Any]:
@@ -232,9 +230,7 @@ def test_an_own_mesh_of_the_tube_is_the_tube(tmp_path: Path) -> None:
     radial = last_row(passive([*RADII, *ALONG], **COMMON["same"] | pressed))
     row = last_row(own(file, **pressed))
     assert row["lumen_volume"] == pytest.approx(3.3 * np.pi * radial["inner_radius"] ** 2, rel=1e-3)
-    assert [row[name] for name in ALONG] == pytest.approx(
-        [radial[name] for name in ALONG], rel=1e-3
-    )
+    assert_close(row, radial, ALONG, 1e-3)
 
 
 # ---------------------------------------------------------------- walls at rest
@@ -292,8 +288,7 @@ def test_a_wall_on_its_way_is_that_of_the_reference() -> None:
     scene = vessel(expected, **EARLY | COMMON["fine"])
     with simulated(scene) as (simulation, of_run):
         assert opening_angle(simulation) == pytest.approx(reference.cut(), abs=0.5)
-    for name, value in expected.items():
-        assert of_run[-1][name] == pytest.approx(value, rel=2e-3), name
+    assert_close(of_run[-1], expected, expected, 2e-3)
 
 
 # ---------------------------------------------------------------- stress and parts of it
@@ -387,8 +382,7 @@ ON_ONE_AND_TWO_RANKS = [{"scene": own_values(TUBE)}]
 def test_two_ranks_find_the_same(both_ranks: Any) -> None:
     """Places and columns."""
     ((one, two),) = both_ranks
-    for name in ("u", "lumen_volume", *ALONG):
-        np.testing.assert_allclose(two[name], one[name], rtol=1e-7, atol=1e-8, err_msg=name)
+    assert_close(two, one, ("u", "lumen_volume", *ALONG), 1e-7, 1e-8)
 
 
 def test_a_wall_without_chains_has_stress_in_the_matrix_alone() -> None:

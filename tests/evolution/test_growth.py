@@ -22,7 +22,7 @@ from tests.mesh_files import COUNTS, LENGTH, RADII, write_tube
 from tests.reference.radial import RadialMaterial
 from tests.reference.wall import Wall
 from tests.runs import goes_on, last_row, made, opening_angle, rows_of, simulated
-from tests.values import ANGLES, isotropic, ramped
+from tests.values import ANGLES, assert_close, isotropic, ramped
 
 SELF = MPI.COMM_SELF
 GROWN = [
@@ -286,8 +286,7 @@ def test_walls_are_those_of_the_reference(case: str) -> None:
     )
     expected = reference.row()
     with simulated(scene.with_values({"output.columns": [*expected]})) as (simulation, rows):
-        for name, value in expected.items():
-            assert rows[-1][name] == pytest.approx(value, rel=2e-3), name
+        assert_close(rows[-1], expected, expected, 2e-3)
         if case in (
             "random tissue",
             "residual stress alone",
@@ -307,8 +306,7 @@ def test_kinematics_agree() -> None:
     ]
     assert rows[0]["growth"] > 1.1
     for row in rows[1:]:
-        for name in ("inner_radius", *GROWN):
-            assert row[name] == pytest.approx(rows[0][name], rel=1e-4), name
+        assert_close(row, rows[0], ("inner_radius", *GROWN), 1e-4)
 
 
 def test_whole_tubes_and_their_files_agree(tmp_path: Path) -> None:
@@ -335,8 +333,7 @@ def test_whole_tubes_and_their_files_agree(tmp_path: Path) -> None:
     }
     file = last_row(scene.with_values(changes | {"geometry": body, "cells.axes": "local"}))
     assert whole["growth"] > 1.1
-    for name in names:
-        assert file[name] == pytest.approx(whole[name], rel=0.03), name
+    assert_close(file, whole, names, 0.03)
 
 
 def test_a_run_goes_on_across_the_start_of_growth(tmp_path: Path) -> None:
@@ -358,8 +355,7 @@ def test_load_cases_grow_alike() -> None:
         {"weight": 0.5, "loads": {"pressure": 1.0}},
     ]
     twice = last_row(wall(0.5, 12.0, None, **values, cases=cases))
-    for name in ("inner_radius", *GROWN):
-        assert twice[name] == pytest.approx(plain[name], rel=1e-8), name
+    assert_close(twice, plain, ("inner_radius", *GROWN), 1e-8)
 
 
 def test_a_folder_of_an_earlier_version_goes_on_as_it_was(tmp_path: Path) -> None:

@@ -15,7 +15,7 @@ from remodel_fenicsx.running import resume, run
 from remodel_fenicsx.scene import scene_from_dict
 from tests.conftest import Case, slowly, warnings_of
 from tests.runs import SELF, simulated
-from tests.values import ANGLES, isotropic
+from tests.values import ANGLES, assert_close, isotropic
 
 
 def values(kinematics: str = "radial", **tables: Any) -> dict[str, Any]:
@@ -57,8 +57,7 @@ def test_it_is_where_time_leads(driver: str) -> None:
     np.testing.assert_allclose(
         at_once.cells.dimension_values, in_time.cells.dimension_values, rtol=0, atol=1e-6
     )
-    for name in ("inner_radius", "outer_radius", "stored_energy"):
-        assert row[name] == pytest.approx(last[name], rel=1e-6)
+    assert_close(row, last, ("inner_radius", "outer_radius", "stored_energy"), 1e-6)
     assert row["inner_radius"] > 1.3  # remodeled, and loaded
 
 
@@ -157,8 +156,7 @@ def test_of_several_states_it_is_the_one_that_time_comes_to(formulation: str) ->
     (at_once, cells, _), (in_time, others, _) = tube_in_time(
         13.332, 0.3, [(0.0, 0.0), (25.0, 1.0)], mesh=mesh, **CAROTID
     )
-    for name in ANGLES:
-        assert at_once[name] == pytest.approx(in_time[name], abs=0.5)
+    assert_close(at_once, in_time, ANGLES, atol=0.5)
     assert in_time["fibre_angle_outer"] < 10
     assert at_once["inner_radius"] == pytest.approx(in_time["inner_radius"], rel=1e-3)
     np.testing.assert_allclose(cells, others, atol=0.01)

@@ -17,7 +17,7 @@ from remodel_fenicsx.system import NOTICE
 from remodel_fenicsx.solver.newton import SolveFailure, Solution
 from tests.conftest import warnings_of
 from tests.runs import goes_on, last_row, made, opening_angle, rows_of, simulated
-from tests.values import ANGLES, TENSION, ramped, isotropic
+from tests.values import ANGLES, TENSION, assert_close, isotropic, ramped
 
 COLUMNS = ["content", "natural_length"]
 GROWS = {"time": 40.0, "deposition_stretch": 1.1, "gain": 1.0}
@@ -255,8 +255,7 @@ def test_a_step_in_parts_has_parts_of_its_turnover(
     monkeypatch.setattr(turnover, "set_fraction", noted)
     rows = [dict(step.row) for step in simulation.steps()]
     simulation.close()
-    for name in (*COLUMNS, *ANGLES, "outer_radius"):
-        assert rows[-1][name] == pytest.approx(whole[-1][name], rel=1e-7), name
+    assert_close(rows[-1], whole[-1], (*COLUMNS, *ANGLES, "outer_radius"), 1e-7)
     assert {fraction for fraction, _ in parts} >= {0.5, 1.0}
     ends = {fraction: value for fraction, value in parts[-10:] if fraction in (0.5, 1.0)}
     assert 0.0 < ends[0.5] < ends[1.0]

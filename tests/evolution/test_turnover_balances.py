@@ -13,7 +13,7 @@ from remodel_fenicsx import Simulation
 from remodel_fenicsx.evolution.stepper import Step, Watcher
 from remodel_fenicsx.model.laws import TURNOVER_RATES, TurnoverRule
 from tests.evolution.test_turnover_bodies import TURNOVER, grown
-from tests.runs import made, simulated
+from tests.runs import columns, made, simulated
 from tests.values import isotropic, ramped
 
 KAPPA = 0.1
@@ -70,8 +70,7 @@ def balances(step: float, coupling: str) -> dict[str, float]:
     with made(of) as simulation:
         powers = Powers(simulation)
         rows = [dict(each.row) for each in simulation.steps([powers])]
-    table = {name: np.array([row[name] for row in rows]) for name in rows[0]}
-    table |= {name: np.array([row[name] for row in powers.rows]) for name in powers.rows[0]}
+    table = columns(rows) | columns(powers.rows)
     np.testing.assert_allclose(table["turnover_power"], table["turnover"], rtol=1e-5, atol=1e-6)
     held = table["time"] >= HELD
     table = {name: values[held] for name, values in table.items()}

@@ -15,8 +15,8 @@ from remodel_fenicsx.model.drivers import DRIVERS
 from remodel_fenicsx.model.energy import Tissue
 from remodel_fenicsx.running import run
 from remodel_fenicsx.scene import scene_from_dict
-from tests.runs import simulated
-from tests.values import TENSION, ramped, isotropic
+from tests.runs import last_row, simulated
+from tests.values import TENSION, assert_close, isotropic, ramped
 
 SELF = MPI.COMM_SELF
 TURNED = ["content", "natural_length"]
@@ -41,13 +41,6 @@ def grown(
         },
     }
     return scene_from_dict(isotropic(kinematics=kinematics, **values | tables))
-
-
-def at_its_end(scene: Any, domain: Any = None) -> tuple[dict[str, float], Simulation]:
-    """The last row, and the simulation, to be looked into."""
-    simulation = Simulation(scene, SELF, domain)
-    rows = [dict(step.row) for step in simulation.steps()]
-    return rows[-1], simulation
 
 
 def points_of(simulation: Simulation) -> tuple[Tissue, np.ndarray, np.ndarray]:
@@ -95,17 +88,17 @@ def test_fields_are_written_where_there_is_turnover(tmp_path: Path) -> None:
 @pytest.mark.parametrize("driver", DRIVERS)
 def test_drivers_see_content_and_natural_length(driver: str, repulsion: str) -> None:
     """Each is that of W with m and rho, by differences."""
-    row, simulation = at_its_end(grown(driver=driver, material={"repulsion": repulsion}))
-    F, found = simulation.stepper.remodeling.driving_tensor()
-    cauchy = cauchy_of_the_energy(simulation)
+    of = grown(driver=driver, material={"repulsion": repulsion})
+    with simulated(of) as (simulation, rows):
+        F, found = simulation.stepper.remodeling.driving_tensor()
+        cauchy = cauchy_of_the_energy(simulation)
     inverse = np.linalg.inv(F)
     expected = {
         "cauchy": cauchy,
         "pk2": np.linalg.det(F)[:, None, None] * inverse @ cauchy @ np.swapaxes(inverse, 1, 2),
         "finger": F @ np.swapaxes(F, 1, 2),
     }
-    simulation.close()
-    assert row["content"] > 1.2 and row["natural_length"] > 1.05
+    assert rows[-1]["content"] > 1.2 and rows[-1]["natural_length"] > 1.05
     np.testing.assert_allclose(found, expected[driver], atol=1e-6 * np.abs(found).max())
 
 
@@ -115,11 +108,9 @@ def layers(**outer: Any) -> Any:
 
 
 def test_regions_of_one_tissue_are_none() -> None:
-    plain, one = at_its_end(grown(mesh={"degree": 2, "refinement": 2}))
-    layered, two = at_its_end(grown(mesh={"degree": 2, "refinement": 2}, regions=layers()))
-    one.close(), two.close()
-    for name in (*TURNED, "inner_radius", "outer_radius"):
-        assert layered[name] == pytest.approx(plain[name], rel=1e-9), name
+    fine = {"degree": 2, "refinement": 2}
+    plain, layered = (last_row(grown(mesh=fine, regions=regions)) for regions in ({}, layers()))
+    assert_close(layered, plain, (*TURNED, "inner_radius", "outer_radius"), 1e-9)
 
 
 def test_each_region_turns_over_with_its_own_chains() -> None:
@@ -133,8 +124,9 @@ def test_each_region_turns_over_with_its_own_chains() -> None:
         "coupling": "staggered",
     }  # the first step is solved with the cells of the start
     of = grown(regions=layers(**outer), time={"end": 2.0, "step": 2.0}, remodeling=remodeling)
-    _, simulation = at_its_end(of)
-    tissue, F, radius = points_of(simulation)
+    with simulated(of) as (simulation, _):
+        tissue, F, radius = points_of(simulation)
+        values = simulation.stepper.process("turnover").higher_order()
     g, is_outer = CHAINS["wormlike"].stiffness, radius > 1.15
     L, r0 = np.where(is_outer, 1.9, tissue.contour_length), np.where(is_outer, 1.2, 1.0)
     np.testing.assert_array_equal(tissue.end_to_end_length, r0)
@@ -142,8 +134,6 @@ def test_each_region_turns_over_with_its_own_chains() -> None:
     tension = stretch * g(stretch * r0, L) / (1.1 * g(1.1 * r0, L))
     content = np.clip(tension - 1.0, -1.0, 1.0) / 10.0
     length = (0.1 + np.maximum(content, 0.0)) * (stretch / 1.1 - 1.0)
-    values = simulation.stepper.process("turnover").higher_order()
-    simulation.close()
     np.testing.assert_allclose(values, 2.0 * np.array([content, length]), rtol=1e-9)
     assert len(set(is_outer)) == 2
 
@@ -185,7 +175,6 @@ def test_one_and_two_ranks_agree(both_ranks: Any) -> None:
     """Random cells in three dimensions, with two load cases."""
     ((one, two),) = both_ranks
     np.testing.assert_allclose(two["l"], one["l"], atol=1e-9)
-    for name in (*TURNED, "growth", "inner_radius@2"):
-        np.testing.assert_allclose(two[name], one[name], rtol=1e-9)
+    assert_close(two, one, (*TURNED, "growth", "inner_radius@2"), 1e-9)
     assert one["inner_radius@2"][-1] > one["inner_radius"][-1] + 0.01
     assert abs(one["content"][-1] - 1.0) > 0.01

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import logging
 from functools import cache
 from typing import Any
 
@@ -133,10 +132,7 @@ def test_a_thick_tube_does_not_lock(
     """Incompressible, closed form."""
     # few halvings: the three steps that go three times as far as their first Newton step are not looked into again
     scene = thick_tube(1e4, SELECTIVE).with_values({"solver.maximum_halvings": 4})
-    with (
-        caplog.at_level(logging.WARNING),
-        simulated(scene, meshed(scene, around, through)) as (_, rows),
-    ):
+    with simulated(scene, meshed(scene, around, through)) as (_, rows):
         assert rows[-1]["inner_radius"] - 1 == pytest.approx(EXACT_TUBE, rel=tolerance)
         assert max(row["newton_iterations"] for row in rows) <= 9
         assert {row["substeps"] for row in rows[1:]} == {1.0}
@@ -146,7 +142,7 @@ def test_a_thick_tube_does_not_lock(
 def test_a_tube_that_locks_is_told(caplog: Any) -> None:
     """Once, with what to set and about how much the displacement lacks."""
     locking = thick_tube(1e3, "displacement")
-    with caplog.at_level(logging.WARNING), simulated(locking, meshed(locking, 16, 8)) as (_, rows):
+    with simulated(locking, meshed(locking, 16, 8)) as (_, rows):
         lacking = 1 - (rows[-1]["inner_radius"] - 1) / EXACT_TUBE
     (line,) = caplog.messages
     assert line.startswith("time 1: volumetric locking: displacements too small by about ")
@@ -178,7 +174,7 @@ def test_a_run_knows_what_its_elements_lack(
     exact = solve_radial(
         pressure, 0.0, 4.0, 4.0, law="none", outer_radius=radius, material=material
     ).inner_radii[-1]
-    with caplog.at_level(logging.WARNING), simulated(scene) as (simulation, rows):
+    with simulated(scene) as (simulation, rows):
         missing = sum(
             LockingWarning(simulation.stepper, formulation == "displacement").missing_deformation()
         )
@@ -204,7 +200,7 @@ def test_elements_that_lock_in_an_elongated_tube_are_told(
         "model.kinematics": kinematics, "cells.initial": "aligned", "cells.aligned_axis": 1,
         "cells.axes": "cylindrical", "loads.elongation": {"value": 0.1, "ramp": ramp_to(4.0)},
     })  # fmt: skip
-    with caplog.at_level(logging.WARNING), simulated(scene) as (simulation, rows):
+    with simulated(scene) as (simulation, rows):
         missing = sum(LockingWarning(simulation.stepper, True).missing_deformation())
     with simulated(scene.with_values({"mesh.refinement": 2, "mesh.degree": 2})) as (_, fine):
         pass
@@ -251,8 +247,7 @@ def mean_angles(ratio: float) -> np.ndarray:
 @pytest.mark.parametrize("degree", [1, 2])
 def test_cells_turn_alike_however_stiff_the_bulk(ratio: float, degree: int, caplog: Any) -> None:
     """By default, from the common soft tissue to the nearly incompressible."""
-    with caplog.at_level(logging.WARNING):
-        found = at_the_end(remodeling_tube(ratio, **{"mesh.degree": degree}))
+    found = at_the_end(remodeling_tube(ratio, **{"mesh.degree": degree}))
     exact = mean_angles(ratio)
     np.testing.assert_allclose(found[:2], exact[:2], rtol=5e-3)
     np.testing.assert_allclose(found[2:], exact[2:], atol=1.0)
@@ -265,8 +260,7 @@ def test_cells_turn_alike_however_stiff_the_bulk(ratio: float, degree: int, capl
 def test_pressure_that_is_noise_is_told(ratio: float, degree: int, told: bool, caplog: Any) -> None:
     """Where J is taken at all points: displacements are right to 3 %, and no warning of locking comes."""
     scene = remodeling_tube(ratio, **{"mesh.degree": degree, "mesh.formulation": "displacement"})
-    with caplog.at_level(logging.WARNING):
-        found = at_the_end(scene)
+    found = at_the_end(scene)
     smooth_pressure = at_the_end(scene.with_values({"mesh.formulation": SELECTIVE}))
     assert (np.abs(found - smooth_pressure)[2:].max() > 1.0) == told
     said = [line for line in caplog.messages if "pressure oscillations" in line]
@@ -298,7 +292,7 @@ def test_linear_tetrahedra_in_a_stiff_bulk_are_told(caplog: Any) -> None:
         "geometry.length": 0.5,
     }
     scene = remodeling_tube(300.0, **values, **{"time.end": 5.0})
-    with caplog.at_level(logging.WARNING), simulated(scene, meshed(scene, 8, 4)):
+    with simulated(scene, meshed(scene, 8, 4)):
         pass
     assert any("pressure oscillations" in line for line in caplog.messages)
 
@@ -312,7 +306,7 @@ def test_what_is_told_can_be_done_and_is_told_once(
 ) -> None:
     """Of accepted steps alone: a step that is taken back has said nothing."""
     scene = remodeling_tube(1e3, **{"time.end": 5.0}, **changes)
-    with caplog.at_level(logging.WARNING), simulated(scene) as (_, rows):
+    with simulated(scene) as (_, rows):
         times = [float(line[5:].split(":")[0]) for line in caplog.messages]
     told = [line for line in caplog.messages if "pressure oscillations" in line]
     assert len(told) == 1 and remedy in told[0]
@@ -344,10 +338,7 @@ def random_artery(**values: Any) -> Scene:
 def test_the_papers_artery_is_fine_enough(caplog: Any) -> None:
     """Where its random cells make strain vary most: two thirds of what is said."""
     artery = random_artery(**{"time.end": 5.0})
-    with (
-        caplog.at_level(logging.WARNING),
-        simulated(artery, meshed(artery, 16, 8, 2)) as (simulation, _),
-    ):
+    with simulated(artery, meshed(artery, 16, 8, 2)) as (simulation, _):
         watcher = LockingWarning(simulation.stepper, True)
         assert 0.025 < sum(watcher.missing_deformation()) < 0.038
     assert not caplog.records
@@ -357,10 +348,7 @@ def test_what_cells_do_is_no_lack_of_elements(caplog: Any) -> None:
     """Under a tenth of the paper's pressure random cells deform the wall by more than the load does."""
     values = {"loads.pressure.value": 0.48, "loads.elongation.value": 0.0, "time.end": 3.0}
     artery = random_artery(**values)
-    with (
-        caplog.at_level(logging.WARNING),
-        simulated(artery, meshed(artery, 16, 8)) as (simulation, _),
-    ):
+    with simulated(artery, meshed(artery, 16, 8)) as (simulation, _):
         watcher = LockingWarning(simulation.stepper, True)
         assert sum(watcher.energies()[1:]) > 0.2 * watcher.work()[0]
     assert "displacements are off by" not in caplog.text

@@ -11,15 +11,15 @@ import ufl
 from mpi4py import MPI
 from numpy.typing import NDArray
 
-from remodel_fenicsx import Recording, Scene, Simulation, cli
+from remodel_fenicsx import Recording, Simulation, cli
 from remodel_fenicsx.body.reductions import AUTO
 from remodel_fenicsx.fem import jit
 from remodel_fenicsx.scene import scene_from_dict
 from remodel_fenicsx.solver.equilibrium import PointStresses
 from tests.conftest import Case
 from tests.parts import tube
-from tests.runs import AtSolved, goes_on, made
-from tests.values import isotropic, ramped
+from tests.runs import columns, goes_on, rows_and_looks, rows_of
+from tests.values import assert_close, isotropic, ramped
 
 SELF = MPI.COMM_SELF
 END = 4.0
@@ -36,20 +36,6 @@ def values(kinematics: str, loads: dict[str, Any], **tables: Any) -> dict[str, A
         kinematics=kinematics,
         **base | {"remodeling": {"kappa": 0.1}, "time": {"end": END}} | tables,
     )
-
-
-def rows_of(scene: Scene, force_of: Any = None) -> tuple[list[dict[str, float]], list[float]]:
-    """Rows of all steps, and what `force_of` says of each solved state."""
-    domain = None
-    if scene.model.kinematics == "full":
-        domain = tube(1.0, 3.0, 1.0, degree=1, divisions=(12, 3, 1), comm=SELF)
-    with made(scene, domain) as simulation:
-        rows, forces = [], []
-        for step in simulation.steps(
-            [AtSolved(lambda step: forces.append(force_of(simulation)))] if force_of else []
-        ):
-            rows.append(step.row)
-    return rows, forces
 
 
 def nodal_reaction(simulation: Simulation) -> float:
@@ -91,42 +77,39 @@ def test_the_reaction_of_a_prescribed_length_gives_that_length(
     length = {"length": 1.0} if kinematics == "full" else {}
     geometry = {"shape": "tube"} | length
     elongation = {"elongation": {"value": 0.1, "ramp": [[0, 0], [END / 2, 1]]}}
-    prescribed, forces = rows_of(
-        scene_from_dict(values(kinematics, elongation, geometry=geometry)), force_of
+    domain = None
+    if length:
+        domain = tube(1.0, 3.0, 1.0, degree=1, divisions=(12, 3, 1), comm=SELF)
+    prescribed, forces = rows_and_looks(
+        values(kinematics, elongation, geometry=geometry), force_of, domain
     )
     assert min(forces) > 1.0 and np.ptp(forces) > 1.0
-    scene = scene_from_dict(values(kinematics, {"axial_force": as_load(forces)}, geometry=geometry))
-    found, _ = rows_of(scene)
-    for name in ("axial_elongation", "inner_radius", "stored_energy"):
-        np.testing.assert_allclose(
-            [row[name] for row in found], [row[name] for row in prescribed], rtol=1e-9
-        )
+    asked = values(kinematics, {"axial_force": as_load(forces)}, geometry=geometry)
+    found = rows_of(asked, domain)
+    names = ("axial_elongation", "inner_radius", "stored_energy")
+    assert_close(columns(found), columns(prescribed), names, 1e-9)
     np.testing.assert_allclose([row["axial_force"] for row in found], forces, rtol=1e-9)
     assert max(row["newton_iterations"] for row in found) <= 6  # one method for field and length
 
 
 def test_closed_ends_carry_the_force_on_the_caps() -> None:
     """p pi r_i^2 of the deformed inner radius."""
-    closed, _ = rows_of(scene_from_dict(values("radial", {}, supports={"ends": "closed"})))
+    closed = rows_of(values("radial", {}, supports={"ends": "closed"}))
     assert "axial_force" not in closed[0] and closed[-1]["axial_elongation"] > 1e-3
     forces = [row["pressure"] * np.pi * row["inner_radius"] ** 2 for row in closed]
-    pulled, _ = rows_of(scene_from_dict(values("radial", {"axial_force": as_load(forces)})))
-    for name in ("axial_elongation", "inner_radius"):
-        np.testing.assert_allclose(
-            [row[name] for row in pulled], [row[name] for row in closed], rtol=1e-9
-        )
-    free, _ = rows_of(scene_from_dict(values("radial", ramped(END, axial_force=0.0))))
+    pulled = rows_of(values("radial", {"axial_force": as_load(forces)}))
+    assert_close(columns(pulled), columns(closed), ("axial_elongation", "inner_radius"), 1e-9)
+    free = rows_of(values("radial", ramped(END, axial_force=0.0)))
     assert free[-1]["axial_elongation"] < 0.0 < closed[-1]["axial_elongation"]
 
 
 def test_the_equilibrium_of_a_closed_tube() -> None:
     """The cells take the length with them."""
     tables = {"supports": {"ends": "closed"}, "output": {"columns": ["pass_residual"]}}
-    at_once, _ = rows_of(
-        scene_from_dict(values("radial", {}, **tables) | {"time": {"end": "equilibrium"}})
-    )
-    in_time, _ = rows_of(
-        scene_from_dict(values("radial", {}, **tables) | {"time": {"end": 240.0, "step": 2.0}})
+    closed = values("radial", {}, **tables)
+    at_once, in_time = (
+        rows_of(closed | {"time": time})
+        for time in ({"end": "equilibrium"}, {"end": 240.0, "step": 2.0})
     )
     assert at_once[-1]["pass_residual"] < 1e-8
     assert at_once[-1]["axial_elongation"] == pytest.approx(
@@ -139,8 +122,7 @@ def test_the_equilibrium_of_a_closed_tube() -> None:
 def test_one_and_two_ranks_agree(case: Case) -> None:
     scene = values("radial", {}, supports={"ends": "closed"})
     one, two = (case(scene, ranks=ranks) for ranks in (1, 2))
-    for name in ("u", "l", "axial_elongation"):
-        np.testing.assert_allclose(two[name], one[name], rtol=1e-11, atol=1e-11)
+    assert_close(two, one, ("u", "l", "axial_elongation"), 1e-11, 1e-11)
 
 
 # ---------------------------------------------------------------- scenes and records

@@ -20,9 +20,9 @@ from remodel_fenicsx.results.columns import Measurement
 from remodel_fenicsx.scene import scene_from_dict
 from tests.conftest import Refused, slowly
 from tests.reference.radial import solve_radial
-from tests.runs import columns_of, made
+from tests.runs import columns, columns_of, made
 from tests.tables import rows as table, values as values_of
-from tests.values import ramped
+from tests.values import assert_close, ramped
 
 SELF = MPI.COMM_SELF
 ISOTROPIC = {"initial": "isotropic"}
@@ -161,10 +161,8 @@ def test_a_quarter_of_random_cells_is_the_tube_that_has_their_mirror_images(
     assert np.ptp(lengths[:, 0, 0]) > 0.9
     cells.set(lengths, cells.initial_axes())
     cells.initial_dimensions[:] = lengths
-    rows = [[step.row for step in one.steps()] for one in (quarter, whole)]
-    for part, body in zip(*rows, strict=True):
-        for name in set(part) - {*OF_THE_SOLVER, "time"}:
-            assert part[name] == pytest.approx(body[name], rel=1e-8, abs=1e-10), name
+    part, body = (columns([step.row for step in one.steps()]) for one in (quarter, whole))
+    assert_close(part, body, set(part) - {*OF_THE_SOLVER}, 1e-8, 1e-10)
     for one in (quarter, whole):
         one.close()
 
@@ -323,8 +321,7 @@ def test_two_ranks_give_the_same(
         if shape == "cube"
         else ["inner_radius", "outer_radius", "fibre_angle_middle"]
     )
-    for column in (*columns, "stored_energy", "max_chain_extension"):
-        np.testing.assert_allclose(two[column], one[column], rtol=1e-12, err_msg=column)
+    assert_close(two, one, (*columns, "stored_energy", "max_chain_extension"), 1e-12)
     np.testing.assert_allclose(two["l"], one["l"], rtol=0, atol=1e-11)
 
 

@@ -9,6 +9,7 @@ from mpi4py import MPI
 from remodel_fenicsx.kernels import CompiledPointKernels, PointKernels
 from remodel_fenicsx.model import energy, spectral
 from remodel_fenicsx.model.cells import UnitCell, structure_tensor
+from tests.values import assert_orthonormal
 
 COUNT = 203  # no multiple of the eight that are done at once
 
@@ -57,9 +58,7 @@ def test_close_values_are_told_apart_as_far_as_their_distance_allows(kernels: Po
     )
     np.testing.assert_allclose(found, values, rtol=0, atol=2e-15)
     assert np.max(np.abs(found_axes - axes) * gap[:, None, None]) < 2e-15
-    np.testing.assert_allclose(
-        found_axes @ np.swapaxes(found_axes, 1, 2), np.tile(np.eye(3), (COUNT, 1, 1)), atol=3e-15
-    )
+    assert_orthonormal(found_axes, 3e-15)
 
 
 def test_what_is_not_finite_is_named(kernels: PointKernels) -> None:

@@ -20,6 +20,7 @@ from remodel_fenicsx.scene import preset_scene
 from remodel_fenicsx.scene.scene import Scene
 from remodel_fenicsx.simulation import Simulation
 from tests.conftest import warnings_of
+from tests.runs import columns
 from tests.tables import rows as table, values as values_of
 from tests.values import deformations
 from tests.watch.test_over_correction import Tilt
@@ -71,10 +72,7 @@ def run(name: str, unit: float, caplog: pytest.LogCaptureFixture) -> Run:
         simulation = Simulation(scene_in(unit, *CASES[name]), MPI.COMM_SELF)
         steps = list(simulation.steps())
     said = [line for line in caplog.messages if "compil" not in line]
-    rows = {
-        column: np.array([step.row[column] for step in steps], dtype=float)
-        for column in steps[0].row
-    }
+    rows = columns([step.row for step in steps])
     rows["pass_residual"] = rows["pass_residual"] / unit**2
     del rows["seconds"]
     return Run(

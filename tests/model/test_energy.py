@@ -17,20 +17,16 @@ from remodel_fenicsx.fem.quadrature import expression_values
 from remodel_fenicsx.model.cells import UnitCell
 from remodel_fenicsx.schema.settings import Material
 from tests.parts import random_rotations
+from tests.reference.radial import secant_stiffness
 
 Array = npt.NDArray[np.float64]
 
 R0 = 1.0
+G0 = secant_stiffness(np.array(R0), 1.594)
 MATERIAL = Material()
 AS_PRINTED = Material(energy_factor=4)
 POINTS_PER_CELL = 8
 CASES = ["isotropic", "transversely isotropic", "orthotropic", "shorter than r0"]
-
-
-def bracket(end_to_end_length: npt.ArrayLike) -> Array:
-    """The bracket of eqs. (7b) and (7c)."""
-    r, big_l = np.asarray(end_to_end_length, dtype=float), 1.594
-    return 1 / big_l + 1 / (4 * r * (1 - r / big_l) ** 2) - 1 / (4 * r)
 
 
 def stress_by_hand(F: Array, l: Array, n: Array, omega: int = 1) -> Array:  # noqa: E741
@@ -51,8 +47,8 @@ def stress_by_hand(F: Array, l: Array, n: Array, omega: int = 1) -> Array:  # no
     r = np.sqrt(np.sum(l**2 * invariants, axis=1))[:, None, None]
     c = omega * k * theta * chains / (4 * persistence_length)
     matrix = ((lame_lambda * np.log(J) - lame_mu) * np.eye(3) + lame_mu * b) / J
-    chain = c / J * bracket(r) * np.sum((l**2)[:, :, None, None] * dyads, axis=1)
-    repulsion = -c / J * bracket(R0) * np.sum((l**2 / invariants)[:, :, None, None] * dyads, axis=1)
+    chain = c / J * secant_stiffness(r, 1.594) * np.sum((l**2)[:, :, None, None] * dyads, axis=1)
+    repulsion = -c / J * G0 * np.sum((l**2 / invariants)[:, :, None, None] * dyads, axis=1)
     return matrix + chain + repulsion
 
 
@@ -173,7 +169,7 @@ def test_stiffness_of_matrix_and_network() -> None:
     r = big_l * np.array([0.1, 1 / big_l, 0.9, 1 - 1e-4])
     slope = 1 / big_l + 1 / (2 * big_l * (1 - r / big_l) ** 3)
     np.testing.assert_allclose(
-        MATERIAL.tissue(R0).stiffness(r), matrix + c * (r**2 * slope + bracket(R0)), rtol=1e-5
+        MATERIAL.tissue(R0).stiffness(r), matrix + c * (r**2 * slope + G0), rtol=1e-5
     )
     assert Material(chain_density=0.0).tissue(R0).stiffness(1.0) == matrix
 

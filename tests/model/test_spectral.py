@@ -5,18 +5,13 @@ import pytest
 
 from remodel_fenicsx.model.spectral import ROUNDING, Array, positive_direction, principal
 from tests.parts import random_rotations, symmetric
+from tests.values import assert_orthonormal
 
 COUNT = 50
 
 
 def absolute_cosines(a: Array, b: Array) -> Array:
     return np.abs(np.sum(a * b, axis=-1))
-
-
-def assert_orthonormal(axes: Array) -> None:
-    np.testing.assert_allclose(
-        axes @ np.swapaxes(axes, 1, 2), np.broadcast_to(np.eye(3), axes.shape), atol=1e-14
-    )
 
 
 @pytest.mark.parametrize("size", [1.0, 1e-200, 1e200])
@@ -27,7 +22,7 @@ def test_distinct_values(size: float) -> None:
     previous = random_rotations(rng, COUNT)
     values, axes = principal(tensors, previous)
     assert np.all(np.diff(values, axis=1) <= 0)
-    assert_orthonormal(axes)
+    assert_orthonormal(axes, 1e-14)
     np.testing.assert_allclose(
         np.swapaxes(axes, 1, 2) @ (values[:, :, None] / size * axes), tensors / size, atol=1e-13
     )
@@ -54,7 +49,7 @@ def test_pair_of_equal_values_keeps_the_previous_axes_in_its_plane(
     true, previous = random_rotations(rng, COUNT), random_rotations(rng, COUNT)
     found, axes = principal(symmetric(values, true), previous)
     np.testing.assert_allclose(found, np.broadcast_to(values, found.shape), atol=1e-13)
-    assert_orthonormal(axes)
+    assert_orthonormal(axes, 1e-14)
     normal = true[:, single]
     np.testing.assert_allclose(absolute_cosines(axes[:, single], normal), 1.0, atol=1e-14)
     first, second = (
@@ -151,7 +146,7 @@ def test_without_previous_axes_the_coordinate_axes_decide() -> None:
     for values in ([2.0, 2.0, 1.0], [2.0, 1.0, 1.0]):
         true = random_rotations(np.random.default_rng(9), COUNT)
         _, axes = principal(symmetric(values, true), np.zeros_like(true))
-        assert_orthonormal(axes)
+        assert_orthonormal(axes, 1e-14)
 
 
 @pytest.mark.parametrize("bad", [np.nan, np.inf, -np.inf])

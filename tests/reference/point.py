@@ -6,8 +6,9 @@ Shares no code with the package. Equilibrium of a point whose axes stay is in te
 from __future__ import annotations
 
 import numpy as np
+from scipy.optimize import fsolve
 
-from tests.reference.radial import Array, RadialMaterial, secant_stiffness
+from tests.reference.radial import Array, RadialMaterial, first_piola_kirchhoff, secant_stiffness
 
 COMPRESSION = 0.1  # weight of what pushes in the law `tensor`
 
@@ -21,6 +22,16 @@ def cauchy(F: Array, A: Array, repulsion: Array, m: RadialMaterial) -> Array:
     )
     inner = m.lame_mu * np.eye(3) + m.network_modulus * (g * A - g0 * repulsion)
     return np.asarray(((m.lame_lambda * np.log(J) - m.lame_mu) * np.eye(3) + F @ inner @ F.T) / J)
+
+
+def uniaxial_stretches(stress: float, dimensions: Array, m: RadialMaterial) -> Array:
+    """Of a point under a nominal stress along its first axis; cells l (3,) along the axes."""
+
+    def balance(stretches: Array) -> Array:
+        found = first_piola_kirchhoff(stretches[None], dimensions[None] ** 2, m)[0]
+        return found - np.array([stress, 0.0, 0.0])
+
+    return np.asarray(fsolve(balance, [1.4, 0.85, 0.85], xtol=1e-13))
 
 
 def repulsion_of_axes(F: Array, l: Array, n: Array) -> Array:

@@ -12,8 +12,8 @@ from remodel_fenicsx import Simulation, cli
 from remodel_fenicsx.scene import Scene, scene_from_dict
 from tests.parts import tube
 from tests.reference.radial import solve_radial
-from tests.runs import AtSolved
-from tests.values import ramped, isotropic
+from tests.runs import last_row, rows_and_looks, rows_of
+from tests.values import assert_close, isotropic, ramped
 
 SELF = MPI.COMM_SELF
 END = 2.0
@@ -31,26 +31,13 @@ def scene(kinematics: str, **tables: Any) -> Scene:
     )
 
 
-def rows_of(
-    made: Scene, look: Any = None, domain: Any = None
-) -> tuple[list[dict[str, float]], list[Any]]:
-    simulation, seen = Simulation(made, SELF, domain), []
-    for step in simulation.steps(
-        [AtSolved(lambda step: seen.append(look(simulation)))] if look else []
-    ):
-        seen.append(step.row)
-    simulation.close()
-    rows = [found for found in seen if isinstance(found, dict)]
-    return rows, [found for found in seen if not isinstance(found, dict)]
-
-
 def test_the_force_is_that_of_the_one_dimensional_reference() -> None:
     """2 pi int sigma_zz r dr of a solver that shares no code; less p pi r_i^2 of its inner radius."""
     reference = solve_radial(pressure=2.4, stretch=0.05, ramp_time=END, end=END, kappa=0.1)
     inside = reference.stretches[..., 0] * reference.stretches[..., 2] * reference.areas
     wall = 2 * np.pi * np.sum(inside * reference.cauchy[..., 1], axis=1)
     thrust = reference.pressures * np.pi * reference.inner_radii**2
-    rows, _ = rows_of(scene("radial", mesh={"refinement": 4, "degree": 2}))
+    rows = rows_of(scene("radial", mesh={"refinement": 4, "degree": 2}))
     np.testing.assert_allclose([row["axial_force"] for row in rows], wall, rtol=1e-6)
     np.testing.assert_allclose(
         [row["reduced_axial_force"] for row in rows], wall - thrust, rtol=1e-6
@@ -60,14 +47,9 @@ def test_the_force_is_that_of_the_one_dimensional_reference() -> None:
 @pytest.mark.parametrize("tables", [{}, {"supports": {"ends": "clamped"}}])
 def test_the_half_plane_and_the_quarter_carry_the_force_of_the_ray(tables: dict[str, Any]) -> None:
     clamped = "supports" in tables
-    rays, _ = rows_of(scene("axisymmetric" if clamped else "radial", **tables))
+    ray = last_row(scene("axisymmetric" if clamped else "radial", **tables))
     for name, tolerance in (("axisymmetric", 1e-9), ("sector", 0.04)):
-        rows, _ = rows_of(scene(name, **tables))
-        for column in FORCES:
-            assert rows[-1][column] == pytest.approx(rays[-1][column], rel=tolerance), (
-                name,
-                column,
-            )
+        assert_close(last_row(scene(name, **tables)), ray, FORCES, tolerance)
 
 
 def reaction(simulation: Simulation) -> tuple[float, float]:
@@ -88,7 +70,7 @@ def test_random_cells_pull_at_the_end_with_the_reaction_of_its_nodes(formulation
     made = scene("full", geometry={"shape": "tube", "length": 1.0}, mesh={"formulation": formulation},
                  cells={"initial": "random", "seed": 3})  # fmt: skip
     domain = tube(1.0, 3.0, 1.0, divisions=(12, 3, 2), comm=SELF)
-    rows, reactions = rows_of(made, reaction, domain)
+    rows, reactions = rows_and_looks(made, reaction, domain)
     for row, (top, bottom) in zip(rows, reactions, strict=True):
         assert row["axial_force"] == pytest.approx(top, rel=1e-9)
         assert abs(top + bottom) > 1e-6 * abs(top)
@@ -104,16 +86,14 @@ def test_random_cells_pull_at_the_end_with_the_reaction_of_its_nodes(formulation
 def test_closed_ends_need_no_force_and_a_load_is_what_a_machine_measures(kinematics: str) -> None:
     for force in (0.0, 5.0):
         loads = ramped(END, pressure=2.4, elongation=0.0, axial_force=force)
-        rows, _ = rows_of(scene(kinematics, supports={"ends": "closed"}, loads=loads))
+        rows = rows_of(scene(kinematics, supports={"ends": "closed"}, loads=loads))
         given = [force * row["time"] / END for row in rows]
         np.testing.assert_allclose([row["reduced_axial_force"] for row in rows], given, atol=1e-8)
         thrust = [row["pressure"] * np.pi * row["inner_radius"] ** 2 for row in rows]
         np.testing.assert_allclose(
             [row["axial_force"] for row in rows], np.add(given, thrust), atol=1e-8
         )
-    rows, _ = rows_of(
-        scene(kinematics, loads=loads)
-    )  # free ends: the load is the force of the wall
+    rows = rows_of(scene(kinematics, loads=loads))  # free ends: the load is the force of the wall
     np.testing.assert_allclose([row["axial_force"] for row in rows], given, atol=1e-8)
 
 
@@ -122,22 +102,18 @@ def test_the_tensor_law_pulls_with_what_its_energy_says() -> None:
     made = scene(
         "radial", remodeling={"law": "tensor", "kappa": 0.1}, material={"repulsion": "log"}
     )
-    simulation = Simulation(made, SELF)
-    column = next(column for column in simulation.observer.columns if column.name == "axial_force")
-    energies = []
 
-    def look(step: Any) -> None:
+    def look(simulation: Simulation) -> float:
         equilibrium, loading = simulation.stepper.coupling.equilibrium, simulation.loading
         loads, found = dict(loading.values), []
         for change in (1e-5, -1e-5):
             loading.set({"elongation": loads["elongation"] + change})
             found.append(equilibrium.stored_energy())
         loading.set(loads)
-        energies.append((found[0] - found[1]) / 2e-5 / made.geometry.axial_length)
+        return (found[0] - found[1]) / 2e-5 / float(made.geometry.axial_length)
 
-    forces = [step.row[column.name] for step in simulation.steps([AtSolved(look)])]
-    simulation.close()
-    np.testing.assert_allclose(forces, energies, rtol=1e-7)
+    rows, energies = rows_and_looks(made, look)
+    np.testing.assert_allclose([row["axial_force"] for row in rows], energies, rtol=1e-7)
 
 
 def test_a_column_that_a_scene_cannot_have_is_refused_before_anything_runs(

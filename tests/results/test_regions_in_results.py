@@ -15,7 +15,7 @@ from remodel_fenicsx.studies import sweep as study
 from tests.conftest import forked_children
 from tests.results.test_resume import assert_same
 from tests.runs import made
-from tests.values import ramp_to
+from tests.values import assert_close, ramp_to
 
 RAMP = ramp_to(3.0)
 VALUES: dict[str, Any] = {
@@ -116,8 +116,7 @@ def test_one_and_two_ranks_agree(both_ranks: Any) -> None:
     ((one, two),) = both_ranks
     np.testing.assert_array_equal(one["l0"], two["l0"])
     assert np.ptp(one["l0"], axis=(0, 1)).min() > 0.5, "isotropic and random cells"
-    for name in (*COLUMNS, "inner_radius", "outer_radius"):
-        np.testing.assert_allclose(two[name], one[name], rtol=0, atol=1e-7, err_msg=name)
+    assert_close(two, one, (*COLUMNS, "inner_radius", "outer_radius"), atol=1e-7)
     np.testing.assert_allclose(two["u"], one["u"], rtol=0, atol=1e-8)
 
 

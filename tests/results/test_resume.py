@@ -40,6 +40,7 @@ from tests.parts import pulled_cube
 from tests.processes import ran
 from tests.runs import made
 from tests.tables import rows as table
+from tests.values import assert_close
 
 END = 9.0
 COUNTED = ("newton_iterations", "linear_iterations", "substeps", "seconds")
@@ -300,16 +301,15 @@ def test_fields_that_are_gone_begin_with_the_next_step(half: Path) -> None:
 # ---------------------------------------------------------------- other numbers of ranks
 
 
-def assert_close(found: Path, expected: Path, history: float = 1e-9, values: float = 1e-8) -> None:
+def assert_nearly_same(
+    found: Path, expected: Path, history: float = 1e-9, values: float = 1e-8
+) -> None:
     """Rows, times and names exactly; numbers as another number of ranks allows."""
     mine, others = Recording(found), Recording(expected)
     assert list(mine.history) == list(others.history)
     assert mine.times.tolist() == others.times.tolist()
     np.testing.assert_array_equal(mine.history["time"], others.history["time"])
-    for name in set(others.history) - set(COUNTED):
-        np.testing.assert_allclose(
-            mine.history[name], others.history[name], rtol=history, atol=history, err_msg=name
-        )
+    assert_close(mine.history, others.history, set(others.history) - {*COUNTED}, history, history)
     kept, wanted = read_checkpoint(found), read_checkpoint(expected)
     assert kept is not None and wanted is not None and kept.number == wanted.number
     np.testing.assert_allclose(structure(kept), structure(wanted), rtol=0, atol=values)
@@ -342,7 +342,7 @@ def two_ranks(first_half: Path, tmp_path_factory: pytest.TempPathFactory) -> tup
 def test_two_ranks_go_on_to_the_last_bit(two_ranks: tuple[Path, str], whole: Path) -> None:
     folder, _ = two_ranks
     assert_same(folder / "resumed", folder / "whole")
-    assert_close(folder / "whole", whole)
+    assert_nearly_same(folder / "whole", whole)
 
 
 def test_it_goes_on_with_another_number_of_ranks(
@@ -353,7 +353,7 @@ def test_it_goes_on_with_another_number_of_ranks(
     assert Recording(half).history["time"][-1] == 8.0
     assert rows(half)[:8] == rows(whole)[:8] != rows(half)[: len(rows(whole))]
     go_on(half)
-    assert_close(half, whole)
+    assert_nearly_same(half, whole)
 
 
 def test_a_rank_without_elements_is_no_hindrance(two_ranks: tuple[Path, str]) -> None:
@@ -382,7 +382,7 @@ def test_a_lost_rank_loses_the_steps_since_the_checkpoint(
     assert time_of_checkpoint(lost) == 4.0 and Recording(lost).history["time"][-1] == LOST_AT - 1
     assert not lock_holder(lost)[1]
     resume(lost, [], SELF)
-    assert_close(lost, whole)
+    assert_nearly_same(lost, whole)
 
 
 # ---------------------------------------------------------------- the command

@@ -9,12 +9,12 @@ from typing import Any
 import pytest
 
 from remodel_fenicsx import read_scene
-from remodel_fenicsx.scene.scene import scene_from_dict
+from remodel_fenicsx.scene.scene import Scene, scene_from_dict
 from remodel_fenicsx.schema.text import set_nested
-from tests.runs import made
+from tests.runs import last_row
 
 
-def cube(**changes: Any) -> dict[str, Any]:
+def cube(**changes: Any) -> Scene:
     """Aligned chains along the load that stay as they are."""
     values: dict[str, Any] = {
         "geometry": {"shape": "cube"},
@@ -26,7 +26,7 @@ def cube(**changes: Any) -> dict[str, Any]:
     }
     for key, value in changes.items():
         set_nested(values, key, value)
-    return values
+    return scene_from_dict(values)
 
 
 @pytest.mark.parametrize("factor", [1, 4])
@@ -37,9 +37,8 @@ def test_the_initial_stiffness_is_what_a_run_shows(factor: int) -> None:
         "material.energy_factor": factor,
         "cells.end_to_end_length": 0.8,
     }
-    scene = scene_from_dict(cube(**keys))
-    with made(scene) as simulation:
-        stretch = list(simulation.steps())[-1].row["mean_stretch"]
+    scene = cube(**keys)
+    stretch = last_row(scene)["mean_stretch"]
     lame_lambda, mu = scene.material.lame_lambda, scene.material.lame_mu
     matrix = mu * (3 * lame_lambda + 2 * mu) / (lame_lambda + mu)
     strain = 1e-4 / scene.geometry.section_area / (matrix + 50.0)
@@ -53,7 +52,7 @@ def test_they_become_the_models_own_numbers(tmp_path: Path) -> None:
         "remodeling.half_life": 10.0,
         "cells.end_to_end_length": 2.0,
     }
-    scene = scene_from_dict(cube(**keys))
+    scene = cube(**keys)
     assert scene.material.contour_length == pytest.approx(3.0, rel=1e-14)
     assert scene.remodeling.kappa == pytest.approx(math.log(2) / 10, rel=1e-14)
     assert scene.material.locking_stretch is None and scene.remodeling.half_life is None
@@ -64,14 +63,10 @@ def test_they_become_the_models_own_numbers(tmp_path: Path) -> None:
 
 def test_the_stiffness_asks_for_the_locking_stretch_of_the_same_scene() -> None:
     """Both together are what the contour length and the density of chains are together."""
-    both = scene_from_dict(
-        cube(**{"material.initial_stiffness": 5.0, "material.locking_stretch": 1.2})
-    )
-    one = scene_from_dict(
-        cube(**{"material.initial_stiffness": 5.0, "material.contour_length": 1.2})
-    )
+    both = cube(**{"material.initial_stiffness": 5.0, "material.locking_stretch": 1.2})
+    one = cube(**{"material.initial_stiffness": 5.0, "material.contour_length": 1.2})
     assert both.material.chain_density == one.material.chain_density
-    softer = scene_from_dict(cube(**{"material.initial_stiffness": 5.0})).material
+    softer = cube(**{"material.initial_stiffness": 5.0}).material
     assert both.material.chain_density < softer.chain_density
 
 
@@ -99,11 +94,7 @@ def test_a_region_has_its_own() -> None:
 
 def test_a_changed_one_replaces_what_was_there() -> None:
     """Sweeps and fits set them on scenes that have every value."""
-    scene = scene_from_dict(cube()).with_values(
-        {"remodeling.half_life": 7.0, "material.initial_stiffness": 3.0}
-    )
-    again = scene_from_dict(
-        cube(**{"remodeling.half_life": 7.0, "material.initial_stiffness": 3.0})
-    )
+    changes = {"remodeling.half_life": 7.0, "material.initial_stiffness": 3.0}
+    scene, again = cube().with_values(changes), cube(**changes)
     assert scene.remodeling.kappa == again.remodeling.kappa
     assert scene.material.chain_density == again.material.chain_density

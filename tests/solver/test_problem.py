@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 import dolfinx.fem
 import numpy as np
 import pytest
@@ -18,10 +16,9 @@ from remodel_fenicsx.solver import newton
 from remodel_fenicsx.solver.newton import SolveFailure
 from tests import parts
 from tests.conftest import slowly
-from tests.parts import cube, smooth, tube
+from tests.parts import clamped_cube, cube, smooth, tube
+from tests.reference.radial import secant_stiffness
 from tests.runs import made
-
-RANDOM = Cells(initial="random", seed=3)
 
 
 # ---------------------------------------------------------------- residual and tangent
@@ -56,7 +53,7 @@ def test_pressure_tangent_is_symmetric_on_the_artery_and_not_with_free_ends(elem
 
 def test_loads_are_what_their_names_say() -> None:
     """On a cube of side 2: the whole force, the pressure times the area, the elongation times the length."""
-    made = parts.body(cube(2.0, refinement=2), RANDOM)
+    made = parts.body(cube(2.0, refinement=2), Cells(initial="random", seed=3))
     made.loading.add_dead_force("force", "z1", component=2)
     made.loading.add_follower_pressure("pressure", "x1")
     made.loading.add_prescribed_elongation("elongation", "z1", 2, 2.0)
@@ -91,15 +88,6 @@ def test_a_prescribed_elongation_is_reached_as_fast_as_newton_can() -> None:
 
 
 # ---------------------------------------------------------------- guards
-def held_cube() -> parts.Body:
-    """Random cells, the bottom clamped, a dead force on the top."""
-    made = parts.body(cube(refinement=2), RANDOM)
-    for component in range(3):
-        made.loading.hold_face("z0", component)
-    made.loading.add_dead_force("force", "z1", component=2)
-    return made
-
-
 LINE_SEARCHES = ["basic", "bt", "cp", "l2"]
 OVERSIZED = 16.5
 
@@ -107,7 +95,7 @@ OVERSIZED = 16.5
 @pytest.fixture(scope="module")
 def small_steps() -> np.ndarray:
     """The displacement under the force of the guard tests, in thirty steps."""
-    made = held_cube()
+    made = clamped_cube()
     problem = made.problem()
     for force in np.linspace(0.0, OVERSIZED, 31)[1:]:
         made.loading.set({"force": force})
@@ -121,7 +109,7 @@ def test_one_oversized_step_ends_on_the_branch_or_where_it_began(
     line_search: str, small_steps: np.ndarray
 ) -> None:
     """Unguarded, the chains converge beyond their contour length: their force is finite and positive there too."""
-    made = held_cube()
+    made = clamped_cube()
     settings = parts.TIGHT.model_copy(
         update={"petsc_options": {"snes_linesearch_type": line_search}}
     )
@@ -275,7 +263,7 @@ def test_a_solve_that_diverges_ends_early(method: str, monkeypatch: pytest.Monke
 @pytest.mark.parametrize("where", ["displacement", "dimensions", "axes"])
 def test_nan_anywhere_is_a_failure_not_a_result(where: str) -> None:
     """Comparisons with NaN are false: a guard written the other way round would let it through."""
-    made = held_cube()
+    made = clamped_cube()
     problem = made.problem()
     made.loading.set({"force": 1.0})
     function = {
@@ -293,7 +281,7 @@ def test_nan_anywhere_is_a_failure_not_a_result(where: str) -> None:
 
 
 def test_a_solve_that_is_cut_off_leaves_the_displacement_where_it_was() -> None:
-    made = held_cube()
+    made = clamped_cube()
     start = 1e-3 * smooth(made.nodes, 1.0, 1).ravel()
     made.set_displacement(start)
     made.loading.set({"force": 3.0})
@@ -303,7 +291,7 @@ def test_a_solve_that_is_cut_off_leaves_the_displacement_where_it_was() -> None:
 
 
 def test_a_failed_solve_leaves_a_solver_that_works() -> None:
-    made = held_cube()
+    made = clamped_cube()
     problem = made.problem()
     made.loading.set({"force": 1.0})
     made.displacement.x.array[7] = np.nan
@@ -311,7 +299,7 @@ def test_a_failed_solve_leaves_a_solver_that_works() -> None:
         problem.solve()
     made.displacement.x.array[:] = 0.0
     problem.solve()
-    again = held_cube()
+    again = clamped_cube()
     again.loading.set({"force": 1.0})
     again.problem().solve()
     np.testing.assert_allclose(made.displacement.x.array, again.displacement.x.array, atol=1e-12)
@@ -348,16 +336,13 @@ def manufactured(x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 def first_piola_kirchhoff(F: np.ndarray, chain_density: float) -> np.ndarray:
     """P = J sigma F^-T of eq. (7) with erratum 5, typed by hand, F (n, 3, 3) real or complex."""
-    lame, mu, big_l = COMPRESSIBLE.lame_lambda, 3.103, 1.594
+    lame, mu = COMPRESSIBLE.lame_lambda, 3.103
     c = 1.381e-23 * 310.0 * chain_density / (4 * 1.365)
-
-    def bracket(r: Any) -> Any:
-        return 1 / big_l + 1 / (4 * r * (1 - r / big_l) ** 2) - 1 / (4 * r)
-
     fibres = np.einsum("nij,Ij->nIi", F, TURNED)  # F n_I
     squared = np.sum(fibres**2, axis=2)
     r = np.sqrt(squared @ DIMENSIONS**2)[:, None]
-    weights = c * DIMENSIONS**2 * (bracket(r) - bracket(1.0) / squared)
+    g, g0 = (secant_stiffness(length, 1.594) for length in (r, 1.0))
+    weights = c * DIMENSIONS**2 * (g - g0 / squared)
     inverse_transposed = np.swapaxes(np.linalg.inv(F), 1, 2)
     matrix = mu * F + (lame * np.log(np.linalg.det(F)) - mu)[:, None, None] * inverse_transposed
     return matrix + np.einsum("nI,nIi,Ij->nij", weights, fibres, TURNED)
@@ -426,7 +411,6 @@ def test_manufactured_solution_is_approached_at_the_elements_rates(
     monkeypatch.setitem(quadrature.DEGREES, (element, FINE), FINE)
     coarse, fine = (errors(n, element, degree, MATERIALS[material]) for n in meshes)
     rates = np.log2(np.array(coarse) / fine)
-    print(f"{element} {degree}: errors {coarse}, {fine}, rates {rates}")
     # linear tetrahedra are the slowest to arrive: 1.53, 1.77, 1.85 for 3, 6, 8 to 6, 12, 16 elements along an edge
     np.testing.assert_allclose(
         rates, [degree + 1, degree], atol=0.2 if (element, degree) == ("tetrahedron", 1) else 0.1

@@ -15,6 +15,7 @@ from tests import parts
 from tests.body.test_cube import closed_form_angle
 from tests.parts import cube
 from tests.reference.radial import RadialMaterial, Tube
+from tests.runs import columns_of, last_row, rows_of, simulated
 from tests.values import ramp_to
 
 PAPER = "kuhl-holzapfel-2007"
@@ -33,7 +34,7 @@ def test_uniaxial_compression_remodels_nothing(density: float, frame: str) -> No
         "remodeling.frame": frame,
     }
     scene = preset_scene(PAPER, "cube").with_values({**changes, "time.end": 20.0})
-    angles = [step.row["mean_fibre_angle"] for step in Simulation(scene).steps()]
+    angles = columns_of(scene)["mean_fibre_angle"]
     np.testing.assert_allclose(angles, np.degrees(np.arctan(np.sqrt(2.0))), rtol=0, atol=1e-10)
 
 
@@ -65,9 +66,9 @@ def test_a_loose_tolerance_remodels_as_a_tight_one(coupling: str) -> None:
     radii, angles = [], []
     for tolerance in (1e-10, 1e-6, 1e-3):
         changes = {**LOOSE, "remodeling.coupling": coupling, "solver.relative_tolerance": tolerance}
-        *_, last = Simulation(preset_scene("consistent", "tube").with_values(changes)).steps()
-        radii.append(last.row["inner_radius"])
-        angles.append(last.row["fibre_angle_outer"])
+        row = last_row(preset_scene("consistent", "tube").with_values(changes))
+        radii.append(row["inner_radius"])
+        angles.append(row["fibre_angle_outer"])
     np.testing.assert_allclose(radii, radii[0], rtol=1e-4)
     np.testing.assert_allclose(angles, angles[0], rtol=1e-3)
 
@@ -77,7 +78,7 @@ def test_a_residual_that_may_be_much_of_the_stress_is_said(
 ) -> None:
     for tolerance in (1e-6, 1e-1):
         changes = {**LOOSE, "time.end": 5.0, "solver.relative_tolerance": tolerance}
-        list(Simulation(preset_scene("consistent", "tube").with_values(changes)).steps())
+        rows_of(preset_scene("consistent", "tube").with_values(changes))
         said = [line for line in caplog.messages if "slowly or not at all" in line]
         assert len(said) == (tolerance == 1e-1), tolerance
     assert "Lower solver.relative_tolerance" in said[0]
@@ -86,9 +87,9 @@ def test_a_residual_that_may_be_much_of_the_stress_is_said(
 def test_weak_tension_remodels_as_strong_tension_does() -> None:
     """The threshold is no load of anybody's: a stress of 1e-6 of the matrix's stiffness is a tension."""
     scene = preset_scene(PAPER, "cube").with_values({"loads.force.value": 3e-5, "time.end": 2.0})
-    _, second = Simulation(scene).steps()
+    _, second = rows_of(scene)
     expected = closed_form_angle(0.025, 1.0)
-    assert second.row["mean_fibre_angle"] == pytest.approx(expected, abs=1e-8)
+    assert second["mean_fibre_angle"] == pytest.approx(expected, abs=1e-8)
 
 
 def test_a_small_force_on_a_slender_body_is_solved() -> None:
@@ -103,8 +104,8 @@ def test_a_small_force_on_a_slender_body_is_solved() -> None:
     stretches = []
     for length in (10.0, 1e4):
         scene = preset_scene(PAPER, "tendon").with_values({**changes, "geometry.length": length})
-        (step,) = Simulation(scene).steps()
-        stretches.append(step.row["mean_stretch"] - 1.0)
+        (row,) = rows_of(scene)
+        stretches.append(row["mean_stretch"] - 1.0)
     assert stretches[0] == pytest.approx(2.4656e-7, rel=1e-3)
     assert stretches[1] == pytest.approx(stretches[0], rel=1e-6)
 
@@ -146,20 +147,17 @@ DIRECT = {
 @pytest.mark.parametrize("lame_lambda", [3.103e4, 3.103e6])
 def test_thin_walls_are_solved(lame_lambda: float) -> None:
     """A displacement of a twelfth of the radius is rounded; over an element of 1/80 of it that is a strain."""
-    simulation = Simulation(
-        preset_scene(PAPER, "tube").with_values({**THIN, "material.lame_lambda": lame_lambda})
-    )
-    *_, last = simulation.steps()
-    elements = simulation.cells.quadrature.shape[0]
+    scene = preset_scene(PAPER, "tube").with_values({**THIN, "material.lame_lambda": lame_lambda})
+    with simulated(scene) as (simulation, rows):
+        elements = simulation.cells.quadrature.shape[0]
     wall = Tube(1.0, 1.05, elements, RadialMaterial(lame_lambda=lame_lambda))
     squares, radii = np.full((len(wall.points), 3), 1 / 3), wall.nodes.copy()
     for pressure in np.linspace(0.0, 0.05, 9)[1:]:
         found = wall.newton(radii, squares, pressure, 1.0)
         assert found is not None
         radii = found
-    assert last.row["inner_radius"] > 1.03
-    assert last.row["inner_radius"] == pytest.approx(radii[0], rel=1e-8)
-    assert last.row["outer_radius"] == pytest.approx(radii[-1], rel=1e-8)
+    found = [rows[-1][name] for name in ("inner_radius", "outer_radius")]
+    assert found == pytest.approx(radii[[0, -1]], rel=1e-8) and found[0] > 1.03
 
 
 def test_a_stiff_wall_with_residual_stress_is_solved() -> None:
@@ -184,15 +182,15 @@ def test_a_stiff_wall_with_residual_stress_is_solved() -> None:
     for name in ("pressure", "elongation"):
         stiff[f"loads.{name}.ramp"] = ramp_to(8.0)
     stiff |= {"remodeling.law": "tensor", "remodeling.kappa": 0.025}
-    steps = list(Simulation(preset_scene(PAPER, "tube").with_values(stiff)).steps())
-    assert len(steps) == 16 and max(step.work.newton_iterations for step in steps) < 60
+    iterations = columns_of(preset_scene(PAPER, "tube").with_values(stiff))["newton_iterations"]
+    assert len(iterations) == 16 and iterations.max() < 60
 
 
 def test_a_refusal_names_a_tolerance_that_works(monkeypatch: pytest.MonkeyPatch) -> None:
     """Where it was too small: made so here by a solver that knows nothing of rounded displacements."""
     monkeypatch.setattr(Convergence.tolerance, "__defaults__", (0.0,))
     with pytest.raises(StepFailure) as caught:
-        list(Simulation(preset_scene(PAPER, "tube").with_values(THIN | DIRECT)).steps())
+        rows_of(preset_scene(PAPER, "tube").with_values(THIN | DIRECT))
     assert (
         caught.value.refusal.kind == "solver tolerance"
         and "stagnates" in caught.value.refusal.advice
@@ -200,15 +198,14 @@ def test_a_refusal_names_a_tolerance_that_works(monkeypatch: pytest.MonkeyPatch)
     named = float(caught.value.refusal.advice.split("solver.relative_tolerance = ")[1].split()[0])
     assert 1e-10 < named <= 1e-6
     changes = THIN | DIRECT | {"solver.relative_tolerance": named}
-    list(Simulation(preset_scene(PAPER, "tube").with_values(changes)).steps())
+    rows_of(preset_scene(PAPER, "tube").with_values(changes))
 
 
 def test_chains_near_their_contour_length_are_solved_to_rounding() -> None:
     """With r0/L = 0.999 the assembled forces themselves are exact to 1e-6 only: no tolerance may ask for more."""
     changes = {"cells.end_to_end_length": 0.999 * 2.125, "time.end": 12.0}
-    scene = preset_scene(PAPER, "cube").with_values(changes)
-    steps = list(Simulation(scene).steps())
-    assert len(steps) == 12 and steps[-1].row["force"] == 10.0
-    assert all(step.row["max_chain_extension"] < 1.0 for step in steps)
+    found = columns_of(preset_scene(PAPER, "cube").with_values(changes))
+    assert len(found["force"]) == 12 and found["force"][-1] == 10.0
+    assert found["max_chain_extension"].max() < 1.0
     expected = closed_form_angle(0.025, 11.0)
-    assert steps[-1].row["mean_fibre_angle"] == pytest.approx(expected, abs=1e-8)
+    assert found["mean_fibre_angle"][-1] == pytest.approx(expected, abs=1e-8)

@@ -15,18 +15,9 @@ from remodel_fenicsx.solver.continuation import CellHomotopy, StepFailure, Work
 from remodel_fenicsx.solver.equilibrium import StateLimits
 from remodel_fenicsx.solver.newton import GuardedNewton, Solution, SolveFailure
 from tests import parts
-from tests.parts import cube, tube
+from tests.parts import clamped_cube, tube
 
 FORCE = 14.0
-
-
-def clamped_cube() -> parts.Body:
-    """Random cells, the bottom clamped, a dead force on the top."""
-    made = parts.body(cube(refinement=2), Cells(initial="random", seed=3))
-    for component in range(3):
-        made.loading.hold_face("z0", component)
-    made.loading.add_dead_force("force", "z1", component=2)
-    return made
 
 
 def solve(stepper: Stepper, time: float) -> Work:

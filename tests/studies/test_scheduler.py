@@ -9,6 +9,7 @@ import subprocess
 import sys
 import time
 from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
 import pytest
@@ -17,7 +18,7 @@ from remodel_fenicsx.results.recording import read_history
 from tests.command.test_extensions import DRIVER, SCENE
 from tests.processes import CHILDREN, has_ended, members, wait_for_rows
 
-AXIS = "loads.force.value=5:10:12"
+AXIS = "loads.force.value=5:10:6"
 PROJECT = Path(__file__).parents[2]
 COMMAND = """import sys; from remodel_fenicsx.system import children; from remodel_fenicsx.cli import main
 children.SECONDS_TO_END = float(sys.argv.pop(1)); sys.exit(main(sys.argv[1:]))"""
@@ -113,15 +114,36 @@ class Engine:
         return found[0].parent
 
 
-@pytest.fixture
-def engine(tmp_path: Path) -> Iterator[Engine]:
-    """A scheduler with two workers; all end with the test."""
-    made = Engine(tmp_path)
+@contextmanager
+def started(folder: Path) -> Iterator[Engine]:
+    """A scheduler with two workers; all of them end."""
+    made = Engine(folder)
     made.add_workers()
     yield made
     for process in (*made.commands, *made.workers, made.scheduler):
         process.kill()
         process.wait()
+
+
+@pytest.fixture
+def engine(tmp_path: Path) -> Iterator[Engine]:
+    """That a test may kill parts of."""
+    with started(tmp_path) as made:
+        yield made
+
+
+@pytest.fixture(scope="module")
+def lasting(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Engine]:
+    """For all tests that leave its workers as they are."""
+    with started(tmp_path_factory.mktemp("engine")) as made:
+        yield made
+
+
+@pytest.fixture
+def shared(lasting: Engine, tmp_path: Path) -> Engine:
+    """With studies in a folder of the test."""
+    lasting.folder = tmp_path
+    return lasting
 
 
 def ended(study: subprocess.Popen[str]) -> tuple[int, list[str]]:
@@ -173,33 +195,33 @@ def test_members_of_a_killed_worker_go_on_elsewhere(
 
 @pytest.mark.parametrize(("number", "code"), [("SIGUSR1", 4), ("SIGTERM", 143), ("SIGKILL", -9)])
 def test_a_stopped_study_leaves_nothing_behind(
-    number: str, code: int, engine: Engine, whole: dict[str, dict[str, list[float]]]
+    number: str, code: int, shared: Engine, whole: dict[str, dict[str, list[float]]]
 ) -> None:
     """And goes on, with a scheduler or without one."""
-    study = engine.study("-o", "out", "-q")
-    engine.wait_for_steps(study)
-    at_work = engine.at_work()
+    study = shared.study("-o", "out", "-q")
+    shared.wait_for_steps(study)
+    at_work = shared.at_work()
     study.send_signal(getattr(signal, number))
     assert ended(study)[0] == code and at_work and all(map(has_ended, at_work))
-    assert not engine.at_work()
-    assert are_stopped(numbers(engine.folder / "out"))
-    again = engine.study if number == "SIGKILL" else engine.alone
+    assert not shared.at_work()
+    assert are_stopped(numbers(shared.folder / "out"))
+    again = shared.study if number == "SIGKILL" else shared.alone
     assert ended(again("-o", "out", "-q")) == (0, [])
-    assert numbers(engine.folder / "out") == whole
+    assert numbers(shared.folder / "out") == whole
 
 
 def test_a_signal_reaches_the_members_of_one_study(
-    engine: Engine, whole: dict[str, dict[str, list[float]]]
+    shared: Engine, whole: dict[str, dict[str, list[float]]]
 ) -> None:
     """Another one at the same scheduler goes on."""
-    first, second = (engine.study("-o", out, "-q", "--jobs", "1") for out in ("one", "two"))
-    engine.wait_for_steps(first, "one")
-    engine.wait_for_steps(second, "two")
+    first, second = (shared.study("-o", out, "-q", "--jobs", "1") for out in ("one", "two"))
+    shared.wait_for_steps(first, "one")
+    shared.wait_for_steps(second, "two")
     first.send_signal(signal.SIGUSR1)
     assert ended(first)[0] == 4 and second.poll() is None
-    assert are_stopped(numbers(engine.folder / "one"))
+    assert are_stopped(numbers(shared.folder / "one"))
     assert ended(second) == (0, [])
-    assert numbers(engine.folder / "two") == whole
+    assert numbers(shared.folder / "two") == whole
 
 
 def test_without_workers_or_scheduler_it_ends_with_a_line(engine: Engine) -> None:
@@ -233,11 +255,11 @@ def test_a_worker_with_other_sources_is_refused(engine: Engine) -> None:
     assert not list((engine.folder / "out").glob("*/history.csv"))
 
 
-def test_extensions_reach_the_workers(engine: Engine) -> None:
-    (engine.folder / "mine.py").write_text(DRIVER)
+def test_extensions_reach_the_workers(shared: Engine) -> None:
+    (shared.folder / "mine.py").write_text(DRIVER)
     words = "--set remodeling.driver=mine --with mine.py --set time.end=2 -o out -q".split()
-    assert ended(engine.study(*words)) == (0, [])
-    assert "mine.py sha256" in next((engine.folder / "out").glob("*/scene.toml")).read_text()
+    assert ended(shared.study(*words)) == (0, [])
+    assert "mine.py sha256" in next((shared.folder / "out").glob("*/scene.toml")).read_text()
 
 
 def test_a_member_that_kills_its_workers_is_given_up(engine: Engine) -> None:

@@ -16,34 +16,8 @@ from tests.tables import rows as table
 from tests.values import ramp_to
 
 SCRIPT = runpy.run_path(str(Path(__file__).parents[2] / "demos" / "which_numbers.py"))
-ABSURD = [
-    "--k1",
-    "996.6",
-    "--k2",
-    "524.6",
-    "--kappa",
-    "0.226",
-    "--c",
-    "7.64",
-    "--angle",
-    "49.98",
-    "--up-to",
-    "1.3",
-]
-PAPER = [
-    "--k1",
-    "2.4",
-    "--k2",
-    "0.84",
-    "--kappa",
-    "0.2",
-    "--c",
-    "3.0",
-    "--angle",
-    "40",
-    "--up-to",
-    "1.3",
-]
+ABSURD = "--k1 996.6 --k2 524.6 --kappa 0.226 --c 7.64 --angle 49.98 --up-to 1.3"
+PAPER = "--k1 2.4 --k2 0.84 --kappa 0.2 --c 3.0 --angle 40 --up-to 1.3"
 
 
 def printed(arguments: list[str], capsys: pytest.CaptureFixture[str]) -> tuple[dict[str, Any], str]:
@@ -79,7 +53,7 @@ def test_the_sheet_of_its_numbers_has_the_stresses_of_the_paper(
     capsys: pytest.CaptureFixture[str],
 ) -> None:
     """Equibiaxial and uniaxial, as `remodel-fenicsx run` has them: within the misfit that it prints."""
-    tables, misfit = printed(PAPER, capsys)
+    tables, misfit = printed(PAPER.split(), capsys)
     share = float(misfit.split("largest stress: ")[1].split(" %")[0]) / 100
     assert 0.001 < share < 0.03
     cells = np.array(
@@ -147,21 +121,19 @@ def test_what_is_refused(
         Path(f"{name}.csv").write_text(f"stretch_x,nominal_stress_x\n{rows}")
     Path("half.csv").write_text("stretch_x\n1.1\n1.2\n")
     with pytest.raises(SystemExit) as left:
-        SCRIPT["main"](
-            words.replace("PAPER", " ".join(PAPER)).replace("ABSURD", " ".join(ABSURD)).split()
-        )
+        SCRIPT["main"](words.replace("PAPER", PAPER).replace("ABSURD", ABSURD).split())
     said = capsys.readouterr().err
     assert left.value.code == 2 and f"error: {line}" in said and said.count("\n") == 1
 
 
 def test_the_largest_stretch_that_it_names_is_taken(capsys: pytest.CaptureFixture[str]) -> None:
     """Its stresses are at most six decades over those at 1.01; what is assumed is said, and the bulk is stiff."""
-    tables, _ = printed([*ABSURD[:-1], "1.139"], capsys)
+    tables, _ = printed([*ABSURD.split()[:-1], "1.139"], capsys)
     found, cells = tables["material"], SCRIPT["np"].square(tables["cells"]["initial"])
     stress = SCRIPT["of_papers"](996.6, 524.6, cells, 0.226, 7.64)
     high, small = (np.max(SCRIPT["nominal"](stress, x, x)) for x in (1.139, 1.01))
     assert 1e5 < high / small < 1e6 and found["lame_lambda"] > 100 * found["lame_mu"]
-    SCRIPT["main"](PAPER)
+    SCRIPT["main"](PAPER.split())
     said = capsys.readouterr().out
     assert said.startswith(
         "# Assumed: cells of dispersion kappa = 0.2, families at +-40 degrees to x; a volume that"
