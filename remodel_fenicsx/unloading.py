@@ -423,7 +423,8 @@ def _missed(simulation: Simulation, given: Array, share: float) -> Array:
         raise ArithmeticError("no admissible state on the path: r >= L or J <= 0")
     coupling.equilibrium.tangent_forms = inverse_tangent(coupling.equilibrium)
     change = coupling.newton.newton_correction(coupling.equilibrium, 0)
-    if coupling.newton.linear.snes.getKSP().getConvergedReason() < 0:
+    snes = coupling.newton.linear.snes
+    if snes.getKSP().getConvergedReason() < 0:
         raise ArithmeticError("the linear solver failed")
     distances: Array = domain.comm.bcast(domain.gather_nodes(-change.reshape(-1, 3)[dofs]))
     if not np.isfinite(distances).all():

@@ -72,15 +72,16 @@ class LimitedMemoryUpdate:
                 self._pairs.append((pair, products[0, 1]))
         self._last = now.copy()
         _, right, better = now
+        product = np.dot if self._comm.size == 1 else self._product
         weights = []
         for (taken, change, image), curvature in reversed(self._pairs):
-            weights.append(self._product(taken, right) / curvature)
+            weights.append(product(taken, right) / curvature)
             right -= weights[-1] * change
             better -= weights[-1] * image
         for ((taken, change, _), curvature), weight in zip(
             self._pairs, reversed(weights), strict=True
         ):
-            better += (weight - self._product(change, better) / curvature) * taken
+            better += (weight - product(change, better) / curvature) * taken
         step.array[:] = better
         return bool(weights)
 
