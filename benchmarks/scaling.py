@@ -13,8 +13,8 @@ there are measured again and replaced. Wall time says something on an idle machi
 The aorta goes from the surface of its lumen (benchmarks/arch.py) through the commands of a user with
 the program's defaults: a wall of 1.2 mm of triangles of SIZE mm, two load steps of a quarter of 80
 mmHg, `unload` on one rank, and 20 steps of remodeling of the unloaded body after its load steps.
-Its tissue has Young's modulus of an adult's aorta, 0.9 MPa. 250,000 unknowns have a size of 3,
-1,000,000 one of 1.5. Its folder is results/aorta-SIZE.
+Its tissue has Young's modulus of an adult's aorta, 0.9 MPa. 251,000 unknowns have a size of 3,
+846,000 one of 1.5. Its folder is results/aorta-SIZE.
 """
 
 from __future__ import annotations
