@@ -675,6 +675,9 @@ CORRELATED = 0.9
 PROFILE_END = 1e-2  # change of the end of an interval, over half of the interval, that is accepted
 MAX_PROFILE_FITS = 15  # for one end of an interval
 PROFILE_EXTRAPOLATION = 3.0  # over the distance of the two last points of a profile
+# Smallest distance of a new point from both ends of a bracket, over its size. Without it, points
+# do not leave a bound near which the unknown has no effect.
+PROFILE_SHARE = 0.1
 LOWER_MINIMUM = 0.1  # decrease of the sum of squares in a profile with which the fit continues
 # Like FIT_TOLERANCE, for the fits of a profile and for all fits before the last.
 PROFILE_TOLERANCE = 1e-4
@@ -986,11 +989,14 @@ def minimised(
     """Minimise the sum of squares from a start, in logarithms, by SciPy's least squares."""
     # The Jacobian, by differences or that of a point `near`, is updated (Broyden 1965) as long as
     # it predicts the residuals, because differences are expensive.
-    from scipy.optimize import least_squares
+    from scipy.optimize import OptimizeResult, least_squares
 
     free = np.array([number != held for number in range(len(start))])
     (lower, upper), bounds = problem.bounds.T, problem.bounds[free].T
     start = np.clip(start, lower, upper)
+    if not free.any():
+        cost = np.sum(problem.residuals(start) ** 2) / 2
+        return OptimizeResult(x=start, cost=cost, near=near)
     last = [x if y == held else y for x, y in problem.fractions]
 
     def whole(x: Array) -> Array:
@@ -1064,6 +1070,8 @@ def profile_end(
         outside = [*beyond, len(known) - 1][0]
         (low, inner), (high, outer) = known[outside - 1 : outside + 1]
         share = (width - low) / max(high - low, (width - low) / PROFILE_EXTRAPOLATION)
+        if beyond:
+            share = np.clip(share, PROFILE_SHARE, 1 - PROFILE_SHARE)
         point = inner.x + share * (outer.x - inner.x)
     lowest = min((fit for _, fit in known), key=attrgetter("cost"))
     return OptimizeResult(lowest, end=np.clip(point, *problem.bounds.T)[held])
@@ -1084,9 +1092,7 @@ def with_profiles(
     steps = width * covariance / result.deviations[:, None]
     room = np.minimum(problem.upper(best.x) - best.x, best.x - problem.bounds[:, 0])
     # A bound within an interval changes the intervals of all unknowns.
-    chosen = np.flatnonzero(
-        (independent < 1 - CORRELATED**2) | (np.any(steps.diagonal() > room) & (len(room) > 1))
-    )
+    chosen = np.flatnonzero((independent < 1 - CORRELATED**2) | np.any(steps.diagonal() > room))
     tasks = {
         f"profile of {result.keys[held]}, {name} end": partial(
             profile_end, best=best, step=side * steps[held], width=width, held=int(held)

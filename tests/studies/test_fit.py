@@ -242,6 +242,21 @@ def test_bands_end_at_bounds_and_know_what_limits_them(tmp_path: Path) -> None:
     assert found["bound"].open == ["upper"] and found["bound"].values == pytest.approx([30.0])
 
 
+def test_an_interval_leaves_a_bound_near_which_the_unknown_has_no_effect(tmp_path: Path) -> None:
+    """Few chains are the best for no stress; the other end is where the sum of squares says."""
+    (tmp_path / "d.csv").write_text("elongation_x,nominal_stress_x\n0.05,0\n0.1,0\n0.2,0\n")
+    unknown = {"material.initial_stiffness": "1.0, lower = 1e-4, upper = 1e4"}
+    data = written(tmp_path, unknown, "d.csv", "nominal_stress_x = 5.0")
+    scene = read_scene(ROOT / "demos" / "sheet.toml")
+    found = fit(scene, data, tmp_path / "found", starts=1, profiles=True)[1]
+    assert found.open == ["lower"] and found.misfit < 1.5
+    least, there = (
+        np.sum(found.problem.residuals(logarithms) ** 2)
+        for logarithms in (found.logarithms, found.band[1])
+    )
+    assert there - least == pytest.approx(3.8415, rel=0.05)
+
+
 def test_what_changes_nothing_is_named(folder: Path) -> None:
     """A rate of remodeling in a test of virgin tissue."""
     text = PAIR.replace(
