@@ -194,6 +194,17 @@ def test_a_thin_wall_is_unloaded_beyond_what_its_forward_tangent_allows(
         np.testing.assert_allclose(nodes_of(found), read_mesh(file).points, rtol=0, atol=1e-9)
 
 
+def test_multigrid_unloads_a_body_whose_tangent_is_not_symmetric(tmp_path: Path) -> None:
+    """The same nodes as by factorisations."""
+    file = write_tube(tmp_path / "tube.msh", "tetrahedron", degree=2, counts=(8, 1, 2))
+    found = {}
+    for method in ("direct", "iterative"):
+        values = own_values(str(file), 1.2) | {"solver": {"method": method}}
+        unloaded(scene_from_dict(values), SELF, tmp_path)
+        found[method] = read_mesh(tmp_path / "unloaded.msh").points
+    np.testing.assert_allclose(found["iterative"], found["direct"], rtol=0, atol=1e-8)
+
+
 ON_ONE_AND_TWO_RANKS = [{"scene": own_values(str(TUBE), 0.6, elongation=0.01)}]
 
 
