@@ -1,7 +1,4 @@
-"""Stresses as columns: against the one-dimensional reference and the law of Laplace.
-
-Those of all kinematics are compared in test_natural_bodies.py.
-"""
+"""Stresses as columns: against the one-dimensional reference, the law of Laplace, and each other's kinematics."""
 
 from __future__ import annotations
 
@@ -110,6 +107,21 @@ def test_the_mean_around_is_that_of_the_law_of_laplace(changes: dict[str, Any]) 
     assert row["mean_hoop_stress"] == pytest.approx(
         row["pressure"] * row["inner_radius"] / thickness, rel=1e-6
     )
+
+
+def test_a_half_plane_has_the_same() -> None:
+    """The sector and the whole tube too: tests/body/test_natural_bodies.py."""
+    short = {
+        "time.end": 3.0,
+        "loads.pressure.ramp": ramp_to(3.0),
+        "loads.pressure.value": 1.5,
+    }
+    short |= {"remodeling.law": "none"}
+    one, other = (
+        last_row(artery(**short, **{"model.kinematics": name}))
+        for name in ("radial", "axisymmetric")
+    )
+    assert_close(other, one, (*NAMES, "mean_hoop_stress"), 1e-6, 1e-6)
 
 
 def test_regions_and_a_mesh_of_ones_own_have_them(tmp_path: Path) -> None:

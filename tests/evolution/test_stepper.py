@@ -124,6 +124,15 @@ def test_watchers_follow_each_step_from_its_solution_to_its_end() -> None:
     assert notes == [(name, *entry) for entry in expected for name in ("first", "second")]
 
 
+def test_the_cells_in_equilibrium_are_those_before_the_pass() -> None:
+    made, stepper = pulled_cube()
+    stepper.advance(1.0)
+    before = made.cells.dimension_values.copy()
+    stepper.advance(2.0)
+    np.testing.assert_array_equal(stepper.state.equilibrium_cells.dimension_values, before)
+    assert np.abs(made.cells.dimension_values - before).max() > 0.01
+
+
 # ---------------------------------------------------------------- all or nothing
 
 

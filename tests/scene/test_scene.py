@@ -335,6 +335,10 @@ def test_the_demos_are_the_preset():
         assert read_scene(path) == printed
 
 
+def test_a_preset_by_name():
+    assert preset_scene(PAPER, "tube") == read_scene(ROOT / "demos" / "artery.toml", ["name=tube"])
+
+
 def test_python_says_what_toml_says():
     built = Scene(
         name="artery",

@@ -54,7 +54,7 @@ def assert_same(found: list[dict[str, float]], expected: list[dict[str, float]])
         "fibre_angle_inner",
         "max_chain_extension",
     )
-    assert_close(columns(found), columns(expected), names, 1e-8)
+    assert_close(columns(found), columns(expected), names, 1e-8, 0.0)
 
 
 # ---------------------------------------------------------------- what is chosen

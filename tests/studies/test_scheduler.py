@@ -18,7 +18,7 @@ from remodel_fenicsx.results.recording import read_history
 from tests.command.test_extensions import DRIVER, SCENE
 from tests.processes import CHILDREN, has_ended, members, wait_for_rows
 
-AXIS = "loads.force.value=5:10:6"
+AXIS = "loads.force.value=5:10:12"
 PROJECT = Path(__file__).parents[2]
 COMMAND = """import sys; from remodel_fenicsx.system import children; from remodel_fenicsx.cli import main
 children.SECONDS_TO_END = float(sys.argv.pop(1)); sys.exit(main(sys.argv[1:]))"""
