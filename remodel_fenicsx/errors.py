@@ -63,5 +63,7 @@ def printable(text: str) -> str:
 
 def shortened(text: str) -> str:
     """Return the text, without its middle if it is too long: its ends have position and reason."""
-    most = LONGEST_MESSAGE
-    return text if len(text) <= most else f"{text[: most // 2 - 3]} ... {text[-(most // 2 - 2) :]}"
+    half = LONGEST_MESSAGE // 2
+    if len(text) <= LONGEST_MESSAGE:
+        return text
+    return f"{text[: half - 3]} ... {text[2 - half :]}"
