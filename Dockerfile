@@ -14,7 +14,7 @@ ENV LANG=C.UTF-8 OMPI_MCA_btl=self,sm OMPI_ALLOW_RUN_AS_ROOT=1 OMPI_ALLOW_RUN_AS
 FROM environment
 LABEL org.opencontainers.image.title="remodel-fenicsx" \
       org.opencontainers.image.description="Remodeling of collagen in living tissue, in FEniCSx" \
-      org.opencontainers.image.version="0.4.0" \
+      org.opencontainers.image.version="0.5.0" \
       org.opencontainers.image.licenses="MIT"
 COPY . /opt/remodel-fenicsx
 ENV PATH=/opt/remodel-fenicsx/bin:$PATH PYTHONPATH=/opt/remodel-fenicsx HOME=/home/remodel
