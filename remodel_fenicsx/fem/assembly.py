@@ -61,13 +61,11 @@ class PMultigrid:
 
     # A factor of the lower level is cheap: it has an eighth of the unknowns.
 
-    def __init__(
-        self, pc: PETSc.PC, prolongation: PETSc.Mat, matrix: PETSc.Mat, is_stiff: bool = False
-    ):
+    def __init__(self, pc: PETSc.PC, prolongation: PETSc.Mat, matrix: PETSc.Mat):
         self._prolongation = prolongation
         self._fine: PETSc.Mat = None  # a copy without blocks of a matrix with them
         self._coarse = self._without_blocks(matrix).PtAP(self._prolongation)
-        self._options = ProblemOptions(levels_options(matrix.comm.size, is_stiff), {})
+        self._options = ProblemOptions(levels_options(matrix.comm.size), {})
         # The solvers of the levels take the prefix that the preconditioner has when they are made.
         self._options.apply(pc)
         pc.setMGInterpolation(1, self._prolongation)

@@ -99,10 +99,8 @@ SLOW_STEP = 2 / 3
 # continues as Newton's method for as many more.
 MOST_RENEWALS = 6
 # Iterations of a linear solve up to which the next one has the same preconditioner. New levels cost
-# about as much as 20 iterations.
-KEPT_LEVELS = 20
-# Lambda/mu above which smoothers take two steps of Chebyshev's iteration.
-SECOND_SWEEP = 50.0
+# about as much as seven iterations.
+KEPT_LEVELS = 8
 # Operations of a factorisation per entry of the tangent up to which a few factorisations cost less
 # than multigrid: 6,200 in a branching wall of 250,000 unknowns; 10,700 in a stout one of 306,000,
 # where both take about as long.
@@ -347,13 +345,6 @@ def takes_levels(equilibrium: Equilibrium, options: ProblemOptions) -> bool:
     )
 
 
-def _bulk_ratio(equilibrium: Equilibrium) -> float:
-    """Return the largest lambda/mu. Collective."""
-    parameters, quadrature = equilibrium.parameters.at_points(), equilibrium.quadrature
-    ratios = parameters.lame_lambda / parameters.lame_mu
-    return quadrature.maximum(ratios.reshape(quadrature.shape))
-
-
 class Multigrid(FullNewton):
     """GMRES with multigrid, and with a factorisation once multigrid has failed."""
 
@@ -373,10 +364,7 @@ class Multigrid(FullNewton):
             self._solver.setPCSide(PETSc.PC.Side.RIGHT)
         if takes_levels(equilibrium, options):
             self._levels = PMultigrid(
-                self._solver.getPC(),
-                prolongation_from_degree_one(space),
-                matrix,
-                is_stiff=_bulk_ratio(equilibrium) > SECOND_SWEEP,
+                self._solver.getPC(), prolongation_from_degree_one(space), matrix
             )
         else:
             matrix.setNearNullSpace(rigid_body_modes(space, matrix))

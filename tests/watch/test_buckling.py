@@ -121,3 +121,27 @@ def test_who_is_told(scene: Scene, told: str, caplog: Any) -> None:
     assert len(lines) == bool(told), lines
     for line in lines:
         assert f"axial {told} is about " in line and "set model.kinematics = 'full'" in line
+
+
+def test_a_wall_whose_chains_nearly_lock_is_a_stiff_column() -> None:
+    """Across the chains differences of the energy are rounding, even 0."""
+    ramp = ramp_to(10.0)
+    scene = Scene(
+        preset="consistent",
+        model={"kinematics": "radial"},
+        mesh={"refinement": 4, "degree": 2},
+        geometry={"shape": "tube", "outer_radius": 1.3, "length": 1.0},
+        cells={"initial": "isotropic"},
+        natural={"opening_angle": 90.0},
+        remodeling={"exponent": 4.0, "driver": "pk2", "kappa": 0.2},
+        loads={
+            "pressure": {"value": 1.2, "ramp": ramp},
+            "elongation": {"value": 0.4, "ramp": ramp},
+        },
+        time={"end": 60.0, "tolerance": 2.0, "step": 5.0},
+    )
+    with watched(scene) as watcher:
+        assert watcher.stepper.coupling.equilibrium.limits().max_chain_extension > 0.999
+        # A tube of Young's modulus 1, which is below that of its chains.
+        inertia = np.pi / 4 * (1.3**4 - 1)
+        assert watcher.euler_load() > np.pi**2 * inertia / 1.4**2
