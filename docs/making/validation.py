@@ -250,13 +250,15 @@ def pulled(case: tuple[str, str, float, float]) -> Row:
         def excess(elongation: float) -> float:
             return share_of(at_rest(label, driver, exponent, elongation)[-1]) - share
 
+        if excess(low) > 0:
+            return found | nothing
         while excess(low + 0.1) < 0:
             low += 0.1
             if low > 0.55:
                 return found | nothing
         length = brentq(excess, low, low + 0.1, xtol=1e-4)
         rows = at_rest(label, driver, exponent, length, pulse=True)
-    except (RemodelError, ValueError):
+    except RemodelError:
         return found | nothing
     rest, less = (
         next(row for row in rows if row["time"] >= time - 1e-9) for time in (150.0, 150.01)

@@ -26,6 +26,12 @@ TUBE = {"geometry.length": 2.0, "time.end": 8.0, "loads.pressure.ramp": ramp_to(
         "loads.elongation.ramp": ramp_to(5.0), "solver.predictor": "none"}  # fmt: skip
 
 
+@pytest.fixture(autouse=True)
+def information(caplog: pytest.LogCaptureFixture) -> None:
+    """All tests see what run.log has."""
+    caplog.set_level(logging.INFO)
+
+
 def simulated(method: str, **changes: Any) -> tuple[Simulation, list[dict[str, float]]]:
     """A tube of two layers with random cells, loaded at full within five steps."""
     values = (
@@ -125,7 +131,6 @@ def matrix_of(values: np.ndarray) -> Any:
 
 def test_factors_of_every_kind(caplog: pytest.LogCaptureFixture) -> None:
     """CHOLMOD, MUMPS for the indefinite and the unsymmetric one, and back; else no answer."""
-    caplog.set_level(logging.INFO)
     rng = np.random.default_rng(3)
     some = rng.standard_normal((30, 30))
     definite, indefinite, general = (
@@ -159,7 +164,6 @@ def test_factors_of_every_kind(caplog: pytest.LogCaptureFixture) -> None:
 
 def test_a_tangent_that_stays_indefinite_is_refused_once(caplog: pytest.LogCaptureFixture) -> None:
     """CHOLMOD is asked again when MUMPS has found no negative pivot."""
-    caplog.set_level(logging.INFO)
     factor, packages = LaggedFactorisation(), []
     for shift in (-3.0, -2.0, -1.0, 1.0, 2.0):
         factor.renew(matrix_of(np.diag(np.arange(5.0)) + shift * np.eye(5) + 0.1))
@@ -187,7 +191,6 @@ def test_a_solve_of_many_factors_goes_on_by_newtons_method(
     caplog: pytest.LogCaptureFixture,
 ) -> None:
     """Then there is one for each iteration, without L-BFGS; twice as many are too many. Parts may have any number."""
-    caplog.set_level(logging.INFO)
     monkeypatch.setattr(linear, "MOST_RENEWALS", 2)
     made, renew = [], Lagged.renew
     monkeypatch.setattr(
@@ -229,7 +232,6 @@ def test_where_old_factors_do_not_do_every_tangent_is_taken(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     """Never renewed, and all of the load in two steps: the first factor is of no use for what follows."""
-    caplog.set_level(logging.INFO)
     monkeypatch.setattr(Lagged, "_costs_more", lambda self, tolerance: False)
     changes = {
         "loads.pressure.ramp": ramp_to(2.0),
@@ -246,7 +248,6 @@ def test_where_old_factors_do_not_do_every_tangent_is_taken(
 
 def test_an_indefinite_tangent_is_solved_by_every_method(caplog: pytest.LogCaptureFixture) -> None:
     """The paper's artery begins with one, by the stress of random cells. CHOLMOD cannot take it."""
-    caplog.set_level(logging.INFO)
     scene, rows, said = preset_scene("kuhl-holzapfel-2007", "tube"), {}, {}
     for method in methods.SOLVER_METHODS:
         domain = tube(divisions=(12, 4, 8), comm=SELF)
@@ -263,7 +264,6 @@ def test_an_indefinite_tangent_is_solved_by_every_method(caplog: pytest.LogCaptu
 
 def test_where_multigrid_fails_a_factor_is_taken(caplog: pytest.LogCaptureFixture) -> None:
     """GMRES may do two iterations, which is enough with a factor alone."""
-    caplog.set_level(logging.INFO)
     changes = {"time__end": 3.0, "loads__pressure__value": 30.0}
     simulation, expected = simulated("direct", **changes)
     simulation.close()
@@ -293,7 +293,6 @@ def test_auto_takes_a_factor_where_it_is_cheap(
     caplog: pytest.LogCaptureFixture,
 ) -> None:
     """By its operations and its memory, of bodies above a size."""
-    caplog.set_level(logging.INFO)
     monkeypatch.setattr(methods, "MIN_MULTIGRID", 0)
     monkeypatch.setattr(linear, limit, value)
     simulation, _ = simulated("auto")
@@ -307,7 +306,6 @@ def test_a_solve_that_the_guards_hold_up_goes_on_in_substeps(
     method: str, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
     """Here with a limit that this step reaches; it comes to the same state."""
-    caplog.set_level(logging.INFO)
     changes = {"loads__pressure__ramp": ramp_to(1.0), "time__end": 1.0}
     changes["loads__pressure__value"] = 12.0
     simulation, expected = simulated(method, **changes)
@@ -330,7 +328,6 @@ def test_degree_one_is_the_next_level_of_degree_two(
     bulk: float, options: dict[str, Any], caplog: pytest.LogCaptureFixture
 ) -> None:
     """Where options of one's own say nothing else."""
-    caplog.set_level(logging.INFO)
     rows, scene = {}, preset_scene("kuhl-holzapfel-2007", "tube")
     values = {
         "mesh.degree": 2,
