@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import runpy
 from collections.abc import Iterator
+from functools import cache
 from itertools import product
 from tempfile import TemporaryDirectory
 from pathlib import Path
@@ -247,6 +248,7 @@ def pulled(case: tuple[str, str, float, float]) -> Row:
     try:
         low = -0.1
 
+        @cache  # brentq begins with both ends
         def excess(elongation: float) -> float:
             return share_of(at_rest(label, driver, exponent, elongation)[-1]) - share
 

@@ -181,7 +181,7 @@ def described(mode: Mode, unloaded: float) -> str:
 # ---------------------------------------------------------------- buckling of whole bodies
 # Strains of the finite differences of W for stresses and moduli, and their relative error.
 STRAINS = {1: 1e-5, 2: 1e-3}
-ERROR = 1e-6
+DIFFERENCE_ERROR = 1e-6
 # Thrust / Euler's load. It is 0.8 to 1.1 when whole slender tubes lose their stability
 # (docs/solver.md, Buckling).
 WARNED_LOAD = 0.9
@@ -243,7 +243,9 @@ class BucklingWarning(WarnsOnce):
             H[i, j] = H[j, i] = self._derivative(i, j)
         coupling = H[:2, ALONG].T[..., None]
         # Where chains nearly lock, the stiffness across them is below the error, even 0.
-        compliance = np.linalg.pinv(H[:2, :2].transpose(2, 0, 1), rcond=ERROR, hermitian=True)
+        compliance = np.linalg.pinv(
+            H[:2, :2].transpose(2, 0, 1), rcond=DIFFERENCE_ERROR, hermitian=True
+        )
         modulus = H[ALONG, ALONG] - (coupling * (compliance @ coupling)).sum(axis=(1, 2))
         around = np.einsum(
             "nij,nj->ni", self.state.elastic_gradient(), self._directions[:, :, AROUND]
