@@ -113,7 +113,7 @@ class SpdSolver:
     ) -> Function:
         """Return u with bilinear(u, v) = linear(v) for all v; None stands for 0. Collective."""
         # Conjugate gradients need no memory for a factorisation. Multigrid helps if the constrained
-        # dofs are far away.
+        # dofs are far away; it is not symmetric, which flexible ones allow.
         unknown, matrix = dolfinx.fem.Function(self.space), self._matrix
         answer = unknown.x.petsc_vec
         load, conditions = answer.duplicate(), list(conditions)
@@ -129,7 +129,7 @@ class SpdSolver:
             condition.set(unknown.x.array)
         solver = PETSc.KSP().create(matrix.comm)
         solver.setOperators(matrix)
-        solver.setType("cg")
+        solver.setType("fcg")
         # If all dofs are constrained, as in one layer of elements, the first guess is the solution.
         multigrid &= (load - matrix * answer).norm() > TOLERANCE * load.norm()
         solver.getPC().setType("gamg" if multigrid else "jacobi")
