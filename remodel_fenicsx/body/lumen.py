@@ -321,8 +321,8 @@ def _thinned(surface: Surface, faulty: Flags, allowed: Array, thickness: Array) 
     radius = _mean_radius(surface)
     if thickness[worst] > radius or allowed[worst] < LEAST_THINNED * thickness[worst]:
         raise SceneError(
-            f"--thickness: too thick: the wall folds or meets itself at {place}, also with a "
-            f"thickness of {allowed[worst]:.3g}; the lumen's radius is {radius:.3g}"
+            f"--thickness: too thick: the wall folds or meets itself at {place} with a "
+            f"thickness of {allowed[worst]:.3g}; the lumen's mean radius is {radius:.3g}"
         )
     result = np.where(faulty, THINNING * allowed, allowed)
     edges = surface.triangles[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2)

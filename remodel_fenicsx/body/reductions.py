@@ -270,8 +270,8 @@ def describe_choice(scene: ReducedScene) -> list[str]:
     for name, reasons in made.objections.items():
         if name != made.name:
             means = " for means over seeds" if reasons_for_means(scene, name) else ""
-            verdict = f"not allowed: {'; '.join(reasons)}" if reasons else f"allowed{means}"
-            lines.append(f"{name!r}, {verdict}")
+            verdict = f"not allowed: {'; '.join(reasons)}" if reasons else f"also allowed{means}"
+            lines.append(f"{name!r} is {verdict}")
     lines += only_for_means(scene)
     if KINEMATICS[made.name].reduced and (swinging := _leaves_symmetry(scene)):
         lines.append(

@@ -113,8 +113,8 @@ def export(
     share = unevenness(fibres.elements, fibres.tensors)
     if fibres.elements.shape[1] > 4 and share > LEAST_SAID:
         log.warning(
-            "the file stores one mean of A per element, up to %.1f %% of tr A away from the mean "
-            "at a node; a run that starts from the file has errors of this size",
+            "each element has one mean tensor A. It differs from the mean at a node by up to "
+            "%.1f %% of tr A; a run that starts from the file has errors of this size",
             100 * share,
         )
     path = Path(folder) / f"fibres{ending}" if path is None else path

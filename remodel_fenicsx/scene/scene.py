@@ -48,7 +48,6 @@ from remodel_fenicsx.schema.settings import (
     REMODELS,
     Region,
     Remodeling,
-    STRESS_UNITS,
     Solver,
     Supports,
     Time,
@@ -112,21 +111,16 @@ def doubts(
     end: float,
 ) -> Iterator[str]:
     """Yield a line for each implausible value; none for plausible tissue."""
-    unit, density = material.stress_unit, material.chain_density
-    pascal = STRESS_UNITS[unit]
+    unit = material.stress_unit
     network = chain_stress(material, end_to_end_length)
     ratio, stiffness = network / material.lame_mu, material.lame_mu + network
     if network and (way := _outside_decades(ratio, NETWORK)):
-        of_pascal = (
-            f" ({density:g} in a scene in Pa corresponds to {density * pascal:g} in {unit})"
-            if pascal > 1
-            else ""
-        )
         yield (
-            f"material.chain_density = {density:g}: the network (c g(r0) r0^2 = {network:.3g} "
-            f"{unit}) is {_format_factor(ratio)} {'softer' if way < 0 else 'stiffer'} "
+            f"material.chain_density = {material.chain_density:g}: "
+            f"the network (c g(r0) r0^2 = {network:.3g} {unit}) is "
+            f"{_format_factor(ratio)} {'softer' if way < 0 else 'stiffer'} "
             f"than the matrix (lame_mu = {material.lame_mu:.4g} {unit}); "
-            f"check its unit, which is 1/m^3{of_pascal}"
+            "check chain_density (in 1/m^3), lame_mu and stress_unit"
         )
     for key, words, ratio, decades in geometry.proportions:
         if _outside_decades(ratio, decades):
@@ -189,8 +183,8 @@ def too_soft(scene: Scene, wall: object = None) -> Iterator[str]:
         yield (
             "loads.pressure.value: the largest pressure causes a mean wall stress of "
             f"{stress:.3g} {unit}, but with chains at {100 * NEAR_LOCKING:g} % of their contour "
-            f"length the tissue bears {most:.3g} {unit}. The tissue is too soft: "
-            "steps take minutes or fail; check material.stress_unit"
+            f"length the tissue bears {most:.3g} {unit}. The pressure is high for this "
+            "tissue: steps may be slow or fail; check the pressure, its unit and stress_unit"
         )
 
 
@@ -427,9 +421,10 @@ class Scene(Table):
     def describe_formulation(self) -> str:
         """Describe the resolved formulation and its reason."""
         needs = self.displacement_reason() if self._bulk_is_stiff else ""
-        ratio = f"lambda/mu = {self._stiffness_ratio:.4g}"
         return (
-            f"formulation {self.formulation!r}: {ratio}{f', but {needs} needs it' if needs else ''}"
+            f"formulation {self.formulation!r}: lambda/mu = {self._stiffness_ratio:.4g}, "
+            f"{'above' if self._bulk_is_stiff else 'not above'} the limit of 'auto'"
+            f"{f'; {needs} needs displacement' if needs else ''}"
         )
 
     @property

@@ -353,7 +353,7 @@ def is_number(value: object) -> TypeGuard[float]:
 
 
 def one_line(error: ValidationError, table: type[Table]) -> str:
-    """Format the first fault as `key = value: rule`, with the number of further faults."""
+    """Format the first fault as `key = value: rule`, with the keys of further faults."""
     faults: dict[str, ErrorDetails] = {}  # a key that allows several types has an error for each
     for detail in sorted(
         error.errors(include_url=False), key=lambda detail: detail["type"] != "extra_forbidden"
@@ -365,8 +365,11 @@ def one_line(error: ValidationError, table: type[Table]) -> str:
         meant = _nearest_key(key, owner)
         if meant in faults and faults[meant]["type"] == "missing":
             del faults[meant]
-    text, more = _describe(next(iter(faults.values())), table), len(faults) - 1
-    return f"{text} (and {more} more fault{'s' if more > 1 else ''})" if more else text
+    first, *others = faults
+    # A list without a valid item is also reported as too short.
+    further = listed([key for key in others if not first.startswith(f"{key}[")], first)
+    text = _describe(faults[first], table)
+    return f"{text} (also wrong or missing: {further})" if further else text
 
 
 def _describe(detail: ErrorDetails, table: type[Table]) -> str:

@@ -187,8 +187,8 @@ class Continuation:
         while done < 1.0:
             attempts += 1
             self.state.tell(
-                f"t = {self.time:g}, {100 * done:.3g} % of {self.stage}, "
-                f"attempt {attempts}: {100 * part:.2g} %"
+                f"step to t = {self.time:g}: at {100 * done:.3g} % of {self.stage}, "
+                f"attempt {attempts}: a substep of {100 * part:.2g} %"
             )
             before = vector.array.copy()
             part = min(part, 1.0 - done, self.largest_increment(done))

@@ -137,14 +137,17 @@ class MeasuredTable(Table):
     state: Literal["virgin", "history", "after"] = "virgin"
     time: _Number = None
     sd: dict[str, Positive] = Field(
-        default={}, json_schema_extra={"allowed": "numbers greater than 0 by column"}
+        default={},
+        json_schema_extra={"allowed": "numbers greater than 0, as in { outer_radius = 0.03 }"},
     )
     scale: dict[str, Literal["unknown"]] = Field(
-        default={}, json_schema_extra={"allowed": "'unknown' by column"}
+        default={}, json_schema_extra={"allowed": "'unknown', as in { pressure = 'unknown' }"}
     )
-    units: dict[str, str] = Field(default={}, json_schema_extra={"allowed": "units by column"})
+    units: dict[str, str] = Field(
+        default={}, json_schema_extra={"allowed": "units, as in { pressure = 'mmHg' }"}
+    )
     columns: dict[str, str] = Field(
-        default={}, json_schema_extra={"allowed": "headers of the file by column"}
+        default={}, json_schema_extra={"allowed": "headers of the file, as in { pressure = 'P' }"}
     )
     rows: Literal["all", "loading", "last loading"] | dict[str, _Values] = Field(
         default="all",
@@ -349,7 +352,8 @@ def _rows(
     for name, gap in gaps.items():
         if gap > 1.0:
             words = "loading and unloading differ by %.2g standard deviations on average"
-            remedy = "the model has no hysteresis; rows = 'last loading' takes loading alone"
+            remedy = "the model has no hysteresis"
+            remedy += "; rows = 'last loading' takes loading alone" * (table.rows == "all")
             log.warning(f"%s, %s: {words}; {remedy}", table.file, name, gap)
     return np.concatenate(chosen), number
 
@@ -1210,8 +1214,11 @@ class Fit(StudyResult):
         text = f"RMS of the normalised residuals: {self.misfit:.2g}; "
         text += f"{same} of {len(self.minima)} starts end in this minimum."
         if self.limited_by == "model":
-            text += " The model limits the accuracy: its residuals exceed the standard deviations, "
-            text += f"so all confidence intervals are {self.inflation:.2g} times as wide."
+            text += (
+                " The model does not follow the data within their standard deviations: check "
+                "columns, units and sd. The model, not the noise, limits the accuracy: all "
+                f"confidence intervals are {self.inflation:.3g} times as wide."
+            )
         pairs = np.argwhere(np.triu(np.abs(self.correlations) > CORRELATED, 1))
         together = [f"{keys[i]} and {keys[j]} ({self.correlations[i, j]:+.2f})" for i, j in pairs]
         if together:

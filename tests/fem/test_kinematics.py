@@ -177,7 +177,7 @@ def test_it_is_named_never_chosen_and_says_what_it_means(caplog: pytest.LogCaptu
     assert len(words) == 1
     left = describe_choice(base.with_values({"model.kinematics": AUTO}))
     assert "'full'" in left[0] and any(
-        line.startswith("'sector', allowed for means over seeds") for line in left
+        line.startswith("'sector' is also allowed for means over seeds") for line in left
     )
     with caplog.at_level("INFO"):
         Simulation(base, SELF).close()

@@ -437,8 +437,7 @@ def test_the_largest_load_is_the_largest_of_the_run():
 
 SOFT = (
     "material.chain_density = 2e+21: the network (c g(r0) r0^2 = 0.00341 kPa) is 910 times (3.0 decades) softer than "
-    "the matrix (lame_mu = 3.103 kPa); check its unit, which is 1/m^3 (2e+21 in a scene in Pa corresponds to 2e+24 in "
-    "kPa)"
+    "the matrix (lame_mu = 3.103 kPa); check chain_density (in 1/m^3), lame_mu and stress_unit"
 )
 
 

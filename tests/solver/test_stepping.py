@@ -73,7 +73,9 @@ def test_a_remodeling_increment_beyond_the_contour_length_ends_where_a_good_star
     said: list[str] = []
     coupling.state.tell = said.append
     assert solve(stepper, FORCE + 1.0).substeps > 1
-    assert said[0].startswith("t = 15, 0 % of the change of the cells, attempt 1: ")
+    assert said[0].startswith(
+        "step to t = 15: at 0 % of the change of the cells, attempt 1: a substep of "
+    )
     assert any(" % of the change of the loads, attempt " in words for words in said)
     assert coupling.equilibrium.limits().admissible
     assert made.loading.values == {"force": FORCE + 1.0}

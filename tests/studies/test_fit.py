@@ -232,7 +232,7 @@ def test_bands_end_at_bounds_and_know_what_limits_them(tmp_path: Path) -> None:
         found[name] = fit(scene, data, tmp_path / name, starts=1)[1]
     for name, one in found.items():
         assert one.limited_by == ("noise" if name == "noise" else "model")
-        assert ("The model limits the accuracy: its residuals exceed" in one.in_words()) is (
+        assert ("The model does not follow the data within their" in one.in_words()) is (
             name != "noise"
         )
     np.testing.assert_allclose(found["a"].band, found["b"].band, rtol=1e-3)
