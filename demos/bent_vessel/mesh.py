@@ -1,4 +1,4 @@
-"""Make vessel.msh with Gmsh: a bent, tapered vessel of two layers, with named faces and volumes.
+"""Make bent.msh with Gmsh: a bent, tapered vessel of two layers, with named faces and volumes.
 
     ./with-fenicsx python3 demos/bent_vessel/mesh.py
 
@@ -101,4 +101,4 @@ def main(path: Path) -> None:
 
 
 if __name__ == "__main__":
-    main(Path(sys.argv[1]) if len(sys.argv) > 1 else Path(__file__).with_name("vessel.msh"))
+    main(Path(sys.argv[1]) if len(sys.argv) > 1 else Path(__file__).with_name("bent.msh"))

@@ -32,7 +32,7 @@ PIXELS = (520, 400)
 FRONT = (0.35, -1.0, 0.42)  # direction from the bodies to the eye
 REPORT = DOCS / "example_report.html"
 MESHES = (
-    ("python3", "demos/bent_vessel/mesh.py", "demos/bent_vessel/vessel.msh"),
+    ("python3", "demos/bent_vessel/mesh.py", "demos/bent_vessel/bent.msh"),
     ("python3", "demos/fork/mesh.py", "demos/fork/fork.msh"),
     ("python3", "demos/own_vessel/lumen.py", "demos/own_vessel/lumen.stl"),
     ("remodel-fenicsx", "wall", "demos/own_vessel/lumen.stl", "--thickness", "0.6", "--size", "0.9", "-o",

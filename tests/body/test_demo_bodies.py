@@ -19,7 +19,7 @@ DEMOS = Path(__file__).parents[2] / "demos"
 def test_the_bent_vessel_says_nothing_at_first(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    line = [sys.executable, str(DEMOS / "bent_vessel" / "mesh.py"), str(tmp_path / "vessel.msh")]
+    line = [sys.executable, str(DEMOS / "bent_vessel" / "mesh.py"), str(tmp_path / "bent.msh")]
     subprocess.run(line, check=True, capture_output=True, timeout=120)
     path, few = shutil.copy(DEMOS / "bent_vessel" / "scene.toml", tmp_path), [
         "--set",

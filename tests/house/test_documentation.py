@@ -36,16 +36,16 @@ def test_pages_that_need_no_run_are_those_that_the_code_makes() -> None:
 def test_the_python_of_the_readme_runs_as_it_stands(tmp_path: Path) -> None:
     """With both commands that stand after it, in their order."""
     (code, commands) = re.findall(
-        r"```python\n(.*?)```\n\nSave it as `mine.py` and run (.*?)\. ",
+        r"```python\n(.*?)```\n\nSave it as `artery.py` and run (.*?)\. ",
         page("README.md"),
         re.DOTALL,
     )[0]
     one, two = (command.split() for command in re.findall(r"`./with-fenicsx (.*?)`", commands))
     short, number = re.subn(r'"time\.end": 30\.0', '"time.end": 1.0', code)
     assert number == 1 and one[0] == "python3" and two == ["mpirun", "-n", "2", *one]
-    (tmp_path / "mine.py").write_text(COARSE + short)
+    (tmp_path / "artery.py").write_text(COARSE + short)
     outputs = [forked("python", COARSE + short, cwd=tmp_path)]
-    command = mpirun(2, sys.executable, "mine.py")
+    command = mpirun(2, sys.executable, "artery.py")
     outputs.append(ran(command, cwd=tmp_path))
     for done, folder in zip(outputs, ("tube", "tube-2"), strict=True):
         assert done.returncode == 0, done.stderr[-2000:]
