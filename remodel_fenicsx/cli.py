@@ -274,13 +274,15 @@ def _fail(message: str, code: int, on_all_ranks: bool) -> int:
 
 
 @contextlib.contextmanager
-def _stopping(kept: str) -> Iterator[None]:
+def _stopping(kept: str, path: Path | None = None) -> Iterator[None]:
     """End the command with a line on what is saved if a signal arrives while the block runs."""
+    # A new file or folder, which is written atomically, may be complete already.
+    new = path if path and not path.exists() else None
     try:
         with interrupts.StopRequest(), interrupts.raise_on_signal():
             yield
     except interrupts.Interrupted as interruption:
-        interruption.kept = kept
+        interruption.kept = f"{new} is complete" if new and new.exists() else kept
         raise
 
 
@@ -478,7 +480,7 @@ def _wall(options: argparse.Namespace) -> None:
     from remodel_fenicsx.body.lumen import write_wall
 
     path = options.output or options.surface.with_suffix(".msh")
-    with _stopping("nothing is written"):
+    with _stopping("nothing is written", path):
         lines = write_wall(
             options.surface,
             path,
@@ -531,7 +533,7 @@ def _axes(options: argparse.Namespace) -> None:
     from remodel_fenicsx.running import write_axes
 
     path = options.output or Path(f"{options.scene.name}-axes.vtu")
-    with _stopping("nothing is written"):
+    with _stopping("nothing is written", path):
         _print(f"{write_axes(options.scene, path)}\nlocal axes in {path}")
 
 
@@ -551,7 +553,7 @@ def _unload(options: argparse.Namespace) -> None:
             "geometry.is = 'unloaded': must be 'loaded' to compute the unloaded body"
         )
     place = options.output or Path(f"{options.scene.name}-unloaded")
-    with _stopping("nothing is written"):
+    with _stopping("nothing is written", place):
         write_unloaded(options.scene, place)
     _print(f"scene of the unloaded body in {place / 'scene.toml'}")
 

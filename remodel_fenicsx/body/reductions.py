@@ -292,13 +292,16 @@ def buckling_risks(scene: ReducedScene) -> list[str]:
     """Describe loads that may buckle the body: negative ones, which are compression or suction."""
     if not scene.geometry.reductions or not scene.geometry.buckles:
         return []
-    smallest = [
-        (name, min(load.value * factor for _, factor in load.ramp))
-        for case in scene.each_case()
-        for name, load in case.loads.items()
-    ]
-    pressing = dict.fromkeys(f"loads.{name}" for name, value in smallest if value < 0)
+    pressing = [f"loads.{name}" for name in negative_loads(scene)]
     return [f"{' and '.join(pressing)} below zero"] if pressing else []
+
+
+def negative_loads(scene: ReducedScene) -> dict[str, None]:
+    """Return the names of loads that are negative at some time: compression or suction."""
+    loads = (item for case in scene.each_case() for item in case.loads.items())
+    return dict.fromkeys(
+        name for name, load in loads if min(load.value * factor for _, factor in load.ramp) < 0
+    )
 
 
 def elements(scene: ReducedScene, name: str) -> int:

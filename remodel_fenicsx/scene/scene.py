@@ -20,7 +20,7 @@ from pydantic import BaseModel, Field, ModelWrapValidatorHandler, SerializeAsAny
 
 from remodel_fenicsx._renamed import with_old_names
 from remodel_fenicsx.body import LoadKind, SHAPES, Shape
-from remodel_fenicsx.body.reductions import AUTO, choice
+from remodel_fenicsx.body.reductions import AUTO, choice, negative_loads
 from remodel_fenicsx.body.shape import Column, columns_of, columns_on_request
 from remodel_fenicsx.body.wall import RoundWall, Walled
 from remodel_fenicsx.fem.formulations import FORMULATIONS, NOT_LOCKING
@@ -620,6 +620,9 @@ class Scene(Table):
                 )
         # Doubtful units explain a soft wall.
         warnings |= {} if warnings else dict.fromkeys(too_soft(self, wall))
+        if "pressure" in negative_loads(self):
+            cost = "" if self.kinematics.reduced else " The run is in 3D, which takes minutes"
+            warnings[f"loads.pressure: below zero, suction; is its sign right?{cost}"] = None
         warnings |= dict.fromkeys(self.geometry.unresolved(self.mesh, self.output.columns))
         tables = self.model_dump(exclude={"loads", "cases"})
         warnings |= dict.fromkeys(_doubted_keys(tables))

@@ -88,6 +88,7 @@ NOT_MEASURED = set(
 )
 SCALE = "scale."  # prefix of the keys of factors on columns
 SCALE_BOUNDS = (1e-3, 1e3)  # bounds of factors on columns
+LEAST_SD = 1e-4  # of a column's range: an instrument is accurate to a thousandth of its range
 WIDE = 1e3  # default bound over the start
 # Distance of a logarithm from the end of a key's range, because derivatives need the values at
 # `LOGARITHM_CHANGE` on both sides.
@@ -308,6 +309,10 @@ def _measured(table: MeasuredTable, place: str, folder: Path, scene: Scene) -> I
                 else "missing: each measured column needs a standard deviation"
             )
             raise SceneError(f"{place}.sd.{name}: {rule}")
+        sd, extent = table.sd.get(name, np.inf), np.ptp(columns[name])
+        if sd < LEAST_SD * extent:
+            words = f"sd = {sd:.3g}, far below its range {extent:.3g}; is it in the scene's unit?"
+            log.warning("%s, %s: %s", table.file, name, words)
     rows, numbers = _rows(columns, loads, labels, table)
     if others := {*table.protocols} - {*numbers}:
         known = ", ".join(map(str, np.unique(numbers)))
@@ -459,8 +464,11 @@ def _read_columns(
         if not by:
             units[name] = unit, factor
     # These warnings come before any solve, which may fail because of their cause.
-    for name in {*columns} & {*stretches, *scene.load_kinds}:
-        if words := convention_doubt(name, columns[name]):
+    mmhg = factor_to_scene("mmHg", STRESS)
+    if scene.material.lame_mu < mmhg:  # softer than any vessel: numbers without units
+        mmhg = np.nan
+    for name in {*columns} & {*stretches, *scene.load_kinds} - {*table.scale}:
+        if words := convention_doubt(name, columns[name], mmhg):
             log.warning("%s, %s: %s", path.name, name, words)
     for name in [*columns]:
         load = re.sub("stretch|green_strain", "elongation", name)
@@ -495,7 +503,17 @@ def _check_columns(
         )
 
 
-WALL = ("wall_thickness", "inner_radius")
+def _unloaded(scene: Scene, table: Measured) -> tuple[int, Columns]:
+    """Return the row of smallest load, and the model there without forces, {} if it fails."""
+    sizes = [np.abs(table.columns[name]) for name in table.loads or ("time",)]
+    row = int(np.argmin(sum(size / (size.max() or 1.0) for size in sizes)))
+    kinds = scene.load_kinds
+    loads = {name: table.columns[name][[row]] for name in table.loads}
+    loads |= {name: np.zeros(1) for name in (*scene.loads, *loads) if kinds[name].dimension}
+    with muted_warnings(), suppress(StepFailure, SceneError):
+        alone = replace(table, state="virgin", columns=loads, loads=tuple(loads))
+        return row, model_of(scene, alone, {})
+    return row, {}
 
 
 def data_warnings(
@@ -504,16 +522,13 @@ def data_warnings(
     """Yield warnings of measured columns that may have another convention than the model."""
     units = dimensions(scene)
     for table, model in zip(tables, modelled, strict=True):
-        pairs = {f"{name} ({units[name]})": (table.columns[name], model[name]) for name in table.sd}
-        pairs = {name: pair for name, pair in pairs.items() if name.split()[0] not in table.scaled}
-        if {*WALL} <= {*table.sd}:
-            thickness, radius = (
-                [columns[name] for columns in (table.columns, model)] for name in WALL
-            )
-            pairs[" / ".join(WALL)] = (thickness[0] / radius[0], thickness[1] / radius[1])
-        for name, pair in pairs.items():
-            if words := convention_doubt(name, *pair):
-                yield f"{table.name}, {name.partition(' (')[0]}: {words}"
+        row, unloaded = _unloaded(scene, table)
+        for name in {*table.sd} - {*table.scaled}:
+            pair = table.columns[name], model[name]
+            if units[name] == "length":
+                pair = pair[0][row], unloaded.get(name, np.array(np.nan))
+            if words := convention_doubt(f"{name} ({units[name]})", *pair):
+                yield f"{table.name}, {name}: {words}"
 
 
 # ---------------------------------------------------------------- model values at measurements
@@ -687,6 +702,10 @@ LOWER_MINIMUM = 0.1  # decrease of the sum of squares in a profile with which th
 PROFILE_TOLERANCE = 1e-4
 # RMS of the normalised residuals. By the noise of ten rows alone it is below 1.35 at 95 %.
 LIMITED_BY_MODEL = 1.5
+# RMS of the normalised residuals of a column above which the model does not follow it. Models miss
+# the shape of a curve by two or three standard deviations of a good instrument; with data in a
+# wrong unit a fit ends above ten.
+MISFIT = 5.0
 FRACTION_MARGIN = 1e-12  # distance of a logarithm from the bound that the sum of fractions sets
 NORMAL_95 = 1.959963984540054  # standard deviations on each side, normal distribution
 
@@ -944,6 +963,8 @@ def fit(
             result = (
                 with_profiles(problem, minima, on_cores) if profiles else result_of(problem, minima)
             )
+        for words in result.warnings():
+            log.warning("%s", words)
         log.info("%s", result.verdict())
         write_whole(
             place / "scene.toml", result.scene.to_toml(f"fitted to {Path(data).name}").encode()
@@ -963,7 +984,7 @@ def _begun(problem: Problem) -> tuple[Array, Array]:
         raise InfeasibleStart(
             f"at the start of the fit {failure}. {failure.refusal}; choose other starts"
         ) from failure
-    for doubt in data_warnings(problem.tables, at_start, problem.scene):
+    for doubt in data_warnings(problem.tables, at_start, problem.scene_of(first)):
         log.warning("%s", doubt)
     jacobian = problem.jacobian(first, central=True)
     problem.check_identifiable(jacobian)
@@ -1206,6 +1227,18 @@ class Fit(StudyResult):
             "method": ["profile" if key in self.profiles else "linear" for key in self.keys],
             "start": [unknown.start for unknown in self.problem.unknowns.values()],
         }
+
+    def warnings(self) -> Iterator[str]:
+        """Yield a line for each fitted column that the model does not follow."""
+        columns = [(table, name) for table in self.problem.fitted for name in table.sd]
+        ends = np.cumsum([table.rows for table, _ in columns])
+        parts = np.split(self.problem.residuals(self.logarithms), ends)
+        for (table, name), part in zip(columns, parts, strict=False):  # the last part: priors
+            if (rms := np.sqrt(np.mean(part**2))) > MISFIT:
+                yield (
+                    f"{table.name}, {name}: the model does not follow these data: the RMS of the "
+                    f"residuals is {rms:.2g} standard deviations; check columns, units and sd"
+                )
 
     def verdict(self) -> str:
         """Return RMS of the normalised residuals, agreement of starts, and correlated unknowns."""

@@ -85,6 +85,13 @@ def test_layers_have_their_volumes_whatever_the_file(
     assert found["adventitia"] == pytest.approx(ring(1.3, 1.5), rel=0.03)
 
 
+def test_a_wall_may_be_thicker_than_the_radius_of_its_lumen(tmp_path: Path) -> None:
+    """Where it does not fold; docs/my_own_vessel.md says so."""
+    file, path = written(tmp_path / "lumen.stl", *tube()), tmp_path / "vessel.msh"
+    assert wall(file, "--thickness", 2.9, "--size", 0.5, "-o", path) == 0
+    assert sum(volumes(path).values()) == pytest.approx(ring(1.0, 3.9), rel=0.03)
+
+
 def test_its_faces_lie_where_they_belong_and_a_scene_takes_it(tmp_path: Path) -> None:
     """Bent by a right angle: ends stay flat; the thickness comes from an array of the file."""
     points, triangles = tube(bend=np.pi / 2)

@@ -194,6 +194,24 @@ def test_a_wall_on_a_large_surface_says_what_it_does_and_ends_at_once(tmp_path: 
     assert list(tmp_path.iterdir()) == [file]
 
 
+def test_a_wall_that_is_stopped_after_its_file_is_complete_says_so(tmp_path: Path) -> None:
+    program = """
+import os, signal, sys
+from remodel_fenicsx import cli
+link = os.link
+def and_stop(*names):
+    link(*names)
+    os.kill(os.getpid(), signal.SIGTERM)
+os.link = and_stop
+sys.exit(cli.main(sys.argv[1:]))
+"""
+    done = forked("python", program, *wall_on(tmp_path)[1][3:])
+    path = tmp_path / "wall.msh"
+    said = f"remodel-fenicsx: stopped by SIGTERM; {path} is complete\n"
+    assert (done.returncode, done.stderr) == (128 + signal.SIGTERM, said)
+    assert path.read_text().endswith("$EndElements\n")
+
+
 def test_a_limit_of_files_is_no_fault_of_a_surface(tmp_path: Path) -> None:
     """Below the size of the surface, and below that of the mesh."""
     file, words = wall_on(tmp_path)

@@ -401,12 +401,7 @@ def test_the_page_leads_from_a_curve_to_numbers(
 ) -> None:
     """docs/fit.md: its files and commands and its fit as they stand; the numbers are the page's."""
     monkeypatch.chdir(tmp_path)
-    page = (ROOT / "docs" / "fit.md").read_text(encoding="utf-8")
-    page = page[page.index("## A measured pressure-radius curve") : page.index("## The two files")]
-    for name, text in re.findall(
-        r"^```(?:text|toml)\n# (\S+)\n(.*?)^```", page, re.MULTILINE | re.DOTALL
-    ):
-        Path(name).write_text(text)
+    page = files_of_the_page(tmp_path)
     (block,) = re.findall(r"^```sh\n(.*?)^```", page, re.MULTILINE | re.DOTALL)
     (line,) = (line for line in block.splitlines() if " fit " in line)
     assert (
@@ -420,6 +415,7 @@ def test_the_page_leads_from_a_curve_to_numbers(
         )
         == 0
     )
+    assert not re.search("does not follow|without load|mmHg in", Path("found/fit.log").read_text())
     table = {row["key"]: row for row in of_csv(Path("found/fit.csv"))}
     said = re.findall(r"^\| `(\w+)` \| ([\d.]+).* \| ([\d.]+) to ([\d.]+) \|$", page, re.MULTILINE)
     assert len(said) == 3
@@ -498,6 +494,50 @@ def test_bounds_are_those_of_the_key(folder: Path, refused: Refused) -> None:
     path.write_text(DATA.replace(kappa, stretch.replace(" }", ", lower = 0.9 }")))
     said = refused("fit", folder / "scene.toml", path, "-o", folder / "out", "-q")
     assert "material.locking_stretch = 0.9: " in said and not (folder / "out").exists()
+
+
+def files_of_the_page(folder: Path) -> str:
+    """The section of docs/fit.md on a measured curve; its files are written into a folder."""
+    page = (ROOT / "docs" / "fit.md").read_text(encoding="utf-8")
+    page = page[page.index("## A measured pressure-radius curve") : page.index("## The two files")]
+    for name, text in re.findall(
+        r"^```(?:text|toml)\n# (\S+)\n(.*?)^```", page, re.MULTILINE | re.DOTALL
+    ):
+        (folder / name).write_text(text)
+    return page
+
+
+@pytest.mark.parametrize("guess", [4.0, 200.0])
+@pytest.mark.parametrize(
+    ("old", "new", "factor", "said"),
+    [
+        ("mm", "mm", 1, ""),
+        ("mm", "mm", 2, "radius: 7.752 at .* is 2.08 times .* 3.7.* without load; are they diameters?"),
+        ('radius = "mm', 'radius = "cm', 1, "radius: 38.76 at .* is 10.4 times .* 3.7.* another unit"),
+        ("mmHg", "kPa", 1, "pressure: 450 mmHg in .* See units"),
+        ("mmHg", "Pa", 1, "pressure: 0.45 mmHg in .* See units"),
+        ("0.03", "2e-5", 1, "radius: sd = 2e-05, far below its range 2.68; is it"),
+    ],
+)  # fmt: skip
+def test_a_fit_warns_of_another_unit_whatever_the_guess(
+    old: str, new: str, factor: int, said: str, guess: float,
+    tmp_path: Path, capsys: pytest.CaptureFixture[str],
+) -> None:  # fmt: skip
+    """The tissue of the guess may be soft or stiff; in the end the model does not follow the data."""
+    files_of_the_page(tmp_path)
+    scene, data, curve = (tmp_path / name for name in ("inflated.toml", "curve.toml", "curve.csv"))
+    scene.write_text(scene.read_text().replace('"20 kPa"', f'"{guess} kPa"'))
+    table = data.read_text().partition("[[measured]]")[2].replace(old, new)
+    unknown = f'"material.lame_mu" = {{ start = {guess} }}'
+    data.write_text(f"[unknowns]\n{unknown}\n[[measured]]{table}")
+    few = (line.split(",") for line in curve.read_text().split()[1::5])
+    rows = [f"{pressure},{factor * float(radius)}" for pressure, radius in few]
+    curve.write_text("\n".join(["pressure,outer_radius", *rows]))
+    words = f"fit {scene} {data} --starts 1 --no-likelihood-profiles -q -o {tmp_path / 'out'}"
+    assert cli.main(words.split()) == 0
+    lines = [line for line in capsys.readouterr().err.splitlines() if "curve.csv" in line]
+    assert len(lines) == 1 + bool(said), lines
+    assert re.search(f"{said}.* does not follow", " ".join(lines))
 
 
 @pytest.mark.parametrize(
