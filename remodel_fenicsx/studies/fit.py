@@ -1248,9 +1248,8 @@ class Fit(StudyResult):
         text += f"{same} of {len(self.minima)} starts end in this minimum."
         if self.limited_by == "model":
             text += (
-                " The model does not follow the data within their standard deviations: check "
-                "columns, units and sd. The model, not the noise, limits the accuracy: all "
-                f"confidence intervals are {self.inflation:.3g} times as wide."
+                " The model, not the noise, limits the accuracy: all confidence intervals are "
+                f"{self.inflation:.3g} times as wide."
             )
         pairs = np.argwhere(np.triu(np.abs(self.correlations) > CORRELATED, 1))
         together = [f"{keys[i]} and {keys[j]} ({self.correlations[i, j]:+.2f})" for i, j in pairs]

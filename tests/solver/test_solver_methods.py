@@ -44,11 +44,15 @@ def simulated(method: str, **changes: Any) -> tuple[Simulation, list[dict[str, f
     return simulation, [step.row for step in simulation.steps()]
 
 
-@pytest.fixture(scope="module")
-def direct() -> list[dict[str, float]]:
-    simulation, rows = simulated("direct")
+def rows_of(method: str, **changes: Any) -> list[dict[str, float]]:
+    simulation, rows = simulated(method, **changes)
     simulation.close()
     return rows
+
+
+@pytest.fixture(scope="module")
+def direct() -> list[dict[str, float]]:
+    return rows_of("direct")
 
 
 def assert_same(found: list[dict[str, float]], expected: list[dict[str, float]]) -> None:
@@ -192,8 +196,7 @@ def test_a_solve_of_many_factors_goes_on_by_newtons_method(
     monkeypatch.setattr(
         Lagged, "renew", lambda self: (renew(self), made.append(self.tangents - self._before))
     )
-    simulation, rows = simulated("lagged")
-    simulation.close()
+    rows = rows_of("lagged")
     assert_same(rows, direct)
     assert 2 < max(made) <= 4 and "once more" not in caplog.text
 
@@ -229,7 +232,7 @@ def test_where_old_factors_do_not_do_every_tangent_is_taken(
         "time.end": 3.0,
         "solver.maximum_iterations": 8,
     }
-    rows = [simulated(method, **changes)[1] for method in ("direct", "lagged")]
+    rows = [rows_of(method, **changes) for method in ("direct", "lagged")]
     assert (
         "Newton failed (no equilibrium within 24 Newton iterations); "
         "retrying with a new factorisation in every iteration" in caplog.text
@@ -256,10 +259,8 @@ def test_an_indefinite_tangent_is_solved_by_every_method(caplog: pytest.LogCaptu
 def test_where_multigrid_fails_a_factor_is_taken(caplog: pytest.LogCaptureFixture) -> None:
     """GMRES may do two iterations, which is enough with a factor alone."""
     changes = {"time__end": 3.0, "loads__pressure__value": 30.0}
-    simulation, expected = simulated("direct", **changes)
-    simulation.close()
-    simulation, rows = simulated("iterative", solver__petsc_options={"ksp_max_it": 2}, **changes)
-    simulation.close()
+    expected = rows_of("direct", **changes)
+    rows = rows_of("iterative", solver__petsc_options={"ksp_max_it": 2}, **changes)
     assert (
         "Newton failed (the linear solver failed); retrying with a factorisation from now on"
         in caplog.text
@@ -299,14 +300,12 @@ def test_a_solve_that_the_guards_hold_up_goes_on_in_substeps(
     """Here with a limit that this step reaches; it comes to the same state."""
     changes = {"loads__pressure__ramp": ramp_to(1.0), "time__end": 1.0}
     changes["loads__pressure__value"] = 12.0
-    simulation, expected = simulated(method, **changes)
-    simulation.close()
+    expected = rows_of(method, **changes)
     assert "too short" not in caplog.text
     caplog.clear()
     monkeypatch.setattr(newton, "SHORT_STEPS", 1)
     monkeypatch.setattr(newton, "SHORT_STEP_HALVINGS", 1)
-    simulation, rows = simulated(method, **changes)
-    simulation.close()
+    rows = rows_of(method, **changes)
     failed = "the guards r < L and J > 0 made the last Newton steps too short"
     assert f"{failed}; solving in substeps" in caplog.text and "retrying" not in caplog.text
     assert_same(rows, expected)
