@@ -129,9 +129,9 @@ class SpdSolver:
             condition.set(unknown.x.array)
         solver = PETSc.KSP().create(matrix.comm)
         solver.setOperators(matrix)
-        solver.setType("fcg")
         # If all dofs are constrained, as in one layer of elements, the first guess is the solution.
         multigrid &= (load - matrix * answer).norm() > TOLERANCE * load.norm()
+        solver.setType("fcg" if multigrid else "cg")
         solver.getPC().setType("gamg" if multigrid else "jacobi")
         levels = None
         if multigrid and self.space.ufl_element().degree > 1:
