@@ -113,7 +113,7 @@ class SpdSolver:
     ) -> Function:
         """Return u with bilinear(u, v) = linear(v) for all v; None stands for 0. Collective."""
         # Conjugate gradients need no memory for a factorisation. Multigrid helps if the constrained
-        # dofs are far away; it is not symmetric, which flexible ones allow.
+        # dofs are far away. For degree 2 it is not symmetric, which flexible gradients allow.
         unknown, matrix = dolfinx.fem.Function(self.space), self._matrix
         answer = unknown.x.petsc_vec
         load, conditions = answer.duplicate(), list(conditions)

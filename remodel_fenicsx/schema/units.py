@@ -268,7 +268,7 @@ CONVENTIONS = (
     Doubt(
         "pressure",
         lambda x, mmhg: 0.0 < np.median(x / mmhg) < 1.0 or np.median(x / mmhg) > 250.0,
-        "{ratio:.3g} mmHg in the median; vessels are tested at 2 to 300: another unit? See units",
+        "{ratio:.3g} mmHg in the median, not within 1 and 250: another unit? See units",
     ),
     # Lengths are compared under the smallest load, with the scene's without pressure or forces but
     # with its elongation and opening angle: the guessed tissue hardly matters.

@@ -503,17 +503,17 @@ def _check_columns(
         )
 
 
-def _unloaded(scene: Scene, table: Measured) -> tuple[int, Columns]:
-    """Return the row of smallest load, and the model there without forces, {} if it fails."""
-    sizes = [np.abs(table.columns[name]) for name in table.loads or ("time",)]
+def _unloaded(scene: Scene, table: Measured, name: str) -> tuple[Array, ArrayLike]:
+    """Return a column at the smallest load, and the model's without forces; NaN if it fails."""
+    sizes = [np.abs(table.columns[load]) for load in table.loads or ("time",)]
     row = int(np.argmin(sum(size / (size.max() or 1.0) for size in sizes)))
-    kinds = scene.load_kinds
-    loads = {name: table.columns[name][[row]] for name in table.loads}
-    loads |= {name: np.zeros(1) for name in (*scene.loads, *loads) if kinds[name].dimension}
+    kinds, value = scene.load_kinds, table.columns[name][row]
+    loads = {load: table.columns[load][[row]] for load in table.loads}
+    loads |= {load: np.zeros(1) for load in (*scene.loads, *loads) if kinds[load].dimension}
     with muted_warnings(), suppress(StepFailure, SceneError):
         alone = replace(table, state="virgin", columns=loads, loads=tuple(loads))
-        return row, model_of(scene, alone, {})
-    return row, {}
+        return value, model_of(scene, alone, {})[name]
+    return value, np.nan
 
 
 def data_warnings(
@@ -522,11 +522,11 @@ def data_warnings(
     """Yield warnings of measured columns that may have another convention than the model."""
     units = dimensions(scene)
     for table, model in zip(tables, modelled, strict=True):
-        row, unloaded = _unloaded(scene, table)
-        for name in {*table.sd} - {*table.scaled}:
-            pair = table.columns[name], model[name]
-            if units[name] == "length":
-                pair = pair[0][row], unloaded.get(name, np.array(np.nan))
+        for name in sorted({*table.sd} - {*table.scaled}):
+            is_length = units[name] == "length"
+            pair = (
+                _unloaded(scene, table, name) if is_length else (table.columns[name], model[name])
+            )
             if words := convention_doubt(f"{name} ({units[name]})", *pair):
                 yield f"{table.name}, {name}: {words}"
 

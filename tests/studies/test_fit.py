@@ -526,7 +526,7 @@ def test_a_fit_warns_of_another_unit_whatever_the_guess(
     """The tissue of the guess may be soft or stiff; in the end the model does not follow the data."""
     files_of_the_page(tmp_path)
     scene, data, curve = (tmp_path / name for name in ("inflated.toml", "curve.toml", "curve.csv"))
-    scene.write_text(scene.read_text().replace('"80 kPa"', f'"{guess} kPa"'))
+    scene.write_text(re.sub(r'"\d+ kPa', f'"{guess} kPa', scene.read_text()))
     table = data.read_text().partition("[[measured]]")[2].replace(old, new)
     unknown = f'"material.lame_mu" = {{ start = {guess} }}'
     data.write_text(f"[unknowns]\n{unknown}\n[[measured]]{table}")
@@ -535,9 +535,9 @@ def test_a_fit_warns_of_another_unit_whatever_the_guess(
         for pressure, radius in (line.split(",") for line in curve.read_text().split()[1::5])
     ]
     curve.write_text("\n".join(["pressure,outer_radius", *rows]))
-    words = f"fit {scene} {data} --starts 1 --no-likelihood-profiles -q -o {tmp_path / 'out'}"
+    words = f"fit {scene} {data} --starts 1 --no-likelihood-profiles -q -o {tmp_path}/out"
     assert cli.main(words.split()) == 0
-    lines = [line for line in capsys.readouterr().err.splitlines() if "curve.csv" in line]
+    lines = re.findall(r".*curve\.csv.*", capsys.readouterr().err)
     assert len(lines) == 1 + bool(said)
     assert re.search(f"{said}.* does not follow", " ".join(lines))
 
